@@ -10,9 +10,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from camera_node import tuned_numbers as tuned
 from camera_node.capture_schedule import CaptureSchedule, RateSchedule
 from camera_node.clocks import ClockError, NodeClock
-from camera_node.settings import DEPTH_STEP, SourceConfig
+from camera_node.settings import SourceConfig
 from camera_node.sources.base import Shot, Source
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
@@ -22,6 +23,11 @@ from freshfield.depth import EncodedDepth
 from freshfield.scenario import Scenario
 
 log = logging.getLogger("camera-node")
+
+# 2^32 by the golden ratio: shot k has depth where k * _DEPTH_STEP mod 2^32 is below 2^32 / depth_every. That is one in
+# depth_every shots, spread evenly (each fifth: 3, 5 or 8 apart), and also one in depth_every of each second, third, ...
+# shot: a link that takes exactly so many captures a frame would never get depth if it came with each so many-th.
+_DEPTH_STEP = 0x9E3779B9
 
 
 class ShotCache:
@@ -165,7 +171,7 @@ class Camera:
     def _encode_depth(self, content: int, shot: Shot) -> EncodedDepth | None:
         if self.source.recorded_codec is not None:
             return self.source.encoded_depth(content)
-        wanted = content * DEPTH_STEP % 2**32 * self._depth_every < 2**32
+        wanted = content * _DEPTH_STEP % 2**32 * self._depth_every < 2**32
         measured = self.source.depth(content, shot) if wanted else None
         return None if measured is None else measured.encode()
 
@@ -179,7 +185,7 @@ def build_cameras(
     config: SourceConfig,
     cameras: Sequence[str],
     data: Path | None = None,
-    cache_bytes: int = 64 * 2**20,
+    cache_bytes: int = tuned.SHOT_CACHE_BYTES,
 ) -> list[Camera]:
     """Open the sources of ``cameras`` with one common cache. Returns them in the scenario's order.
 

@@ -10,14 +10,11 @@ from dataclasses import dataclass
 import grpc
 import grpc.aio
 
+from camera_node import tuned_numbers as tuned
 from freshfield.clock import Clock
 from freshfield.v1 import clock_pb2 as pb
 from freshfield.v1 import clock_pb2_grpc as rpc
 
-PERIOD_S = 1.0
-# The first exchanges follow each other quickly, so that early frames get a good estimate too.
-_FIRST = 4
-_FIRST_PERIOD_S = 0.05
 # 146 years. Real clocks differ at most by the time since 1970, and a frame's header can hold this much.
 _MAX_OFFSET_NS = 2**62
 
@@ -34,14 +31,14 @@ class Offset:
 
 
 class OffsetEstimator:
-    """NTP's estimate: the offset of the exchange with the smallest error bound among the last 16.
+    """NTP's estimate: the offset of the exchange with the smallest error bound among the last ``KEPT_OFFSETS``.
 
     The bound is half the round trip plus ``drift_ppm`` (parts per million) of the exchange's age, so the
     estimate follows a drifting clock. Thread-safe.
     """
 
-    def __init__(self, drift_ppm: float = 50.0) -> None:
-        self._samples: deque[tuple[int, int, int]] = deque(maxlen=16)
+    def __init__(self, drift_ppm: float = tuned.OFFSET_DRIFT_PPM) -> None:
+        self._samples: deque[tuple[int, int, int]] = deque(maxlen=tuned.KEPT_OFFSETS)
         self._drift = drift_ppm * 1e-6
         self._lock = threading.Lock()
 
@@ -97,7 +94,7 @@ class ClockSync:
             # A call made while the connection is being set up would include the set-up in its round trip.
             await self._channel.channel_ready()
             try:
-                answered = await exchange(self._channel, self._metadata, self._clock, fresh, PERIOD_S)
+                answered = await exchange(self._channel, self._metadata, self._clock, fresh, tuned.OFFSET_PERIOD_S)
             except (grpc.RpcError, grpc.aio.BaseError):
                 answered = False  # the senders log what is wrong with the peer
             if answered:
@@ -106,9 +103,10 @@ class ClockSync:
                 # After a failed exchange the peer may be another process with another clock: start anew, but
                 # use the old estimate until the new one has a few exchanges.
                 fresh, exchanges = OffsetEstimator(), 0
-            if exchanges == _FIRST:
+            if exchanges == tuned.FIRST_OFFSETS:
                 self._estimator = fresh
-            await asyncio.sleep(_FIRST_PERIOD_S if 0 < exchanges < _FIRST else PERIOD_S)
+            first = 0 < exchanges < tuned.FIRST_OFFSETS
+            await asyncio.sleep(tuned.FIRST_OFFSETS_PERIOD_S if first else tuned.OFFSET_PERIOD_S)
 
 
 async def exchange(

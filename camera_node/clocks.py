@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Protocol
 
+from camera_node import tuned_numbers as tuned
 from freshfield.clock import Clock
 
 
@@ -44,7 +45,7 @@ class ArrivalClock:
     drift apart. The delay of the fastest sample (a cable, a cycle of the device) remains in the result.
     """
 
-    def __init__(self, window_ns: int = 5_000_000_000) -> None:
+    def __init__(self, window_ns: int = tuned.ARRIVAL_WINDOW_NS) -> None:
         self._window_ns = window_ns
         self._least: deque[tuple[int, int]] = deque()  # (arrival, offset), offsets increasing
 

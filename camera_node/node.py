@@ -16,6 +16,7 @@ from typing import Any
 
 import grpc.aio
 
+from camera_node import tuned_numbers as tuned
 from camera_node.capture import Camera, prepare
 from camera_node.clock_offset import ClockSync
 from camera_node.clocks import NodeClock
@@ -30,11 +31,6 @@ from freshfield.scenario import Scenario
 from freshfield.transport import Transport
 
 log = logging.getLogger("camera-node")
-
-STATUS_PERIOD_S = 1.0
-# How long a clean exit waits for the answers to frames already sent.
-_LAST_ANSWERS_S = 1.0
-_READY_POLL_S = 0.01
 
 
 @dataclass(frozen=True)
@@ -54,7 +50,7 @@ class NodeOptions:
     clock: Clock = field(default_factory=WallClock)
     out: Path | None = None
     seconds: float | None = None
-    response_timeout_s: float = 5.0
+    response_timeout_s: float = tuned.ANSWER_TIMEOUT_S
 
 
 class Node:
@@ -161,7 +157,7 @@ class Node:
             # Wait for the connection: a recording that started earlier would lose its beginning.
             self._enter("connecting")
             while not all(sender.ready for sender in self.senders.values()):
-                await asyncio.sleep(_READY_POLL_S)
+                await asyncio.sleep(tuned.READY_POLL_S)
         self._enter("streaming")
         log.info("streaming %s", ", ".join(camera.name for camera in self._cameras))
         start_ns = self._clock.now_ns()
@@ -227,9 +223,9 @@ class Node:
 
     async def _last_answers(self) -> None:
         try:
-            async with asyncio.timeout(_LAST_ANSWERS_S):
+            async with asyncio.timeout(tuned.LAST_ANSWERS_S):
                 while any(s.busy or (s.connected and s.outbox.waiting) for s in self.senders.values()):
-                    await asyncio.sleep(0.01)
+                    await asyncio.sleep(tuned.LAST_ANSWERS_POLL_S)
         except TimeoutError:
             pass  # those frames are recorded as broken
 
@@ -254,7 +250,7 @@ class Node:
     async def _report(self) -> None:
         while True:
             self._write_status()
-            await asyncio.sleep(STATUS_PERIOD_S)
+            await asyncio.sleep(tuned.STATUS_PERIOD_S)
 
     def _write_status(self) -> None:
         if self._options.out is not None:

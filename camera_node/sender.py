@@ -14,6 +14,7 @@ import grpc
 import grpc.aio
 import numpy as np
 
+from camera_node import tuned_numbers as tuned
 from camera_node.clock_offset import Offset
 from camera_node.outbox import Outbox
 from freshfield.frame import Frame, to_request
@@ -24,16 +25,6 @@ from freshfield.v1 import frames_pb2_grpc as rpc
 
 log = logging.getLogger("camera-node")
 
-FIRST_BACKOFF_S = 0.2
-MAX_BACKOFF_S = 1.0
-# How long one attempt waits for a peer that cannot be reached.
-CONNECT_S = 6.0
-# How long the first frame waits for the first clock exchange; with a peer that tells no time, only once.
-OFFSET_WAIT_S = 2.0
-_OFFSET_POLL_S = 0.01
-# An answer may take this many times as long as the slowest recent one, and at least this many seconds.
-_PATIENCE, _LEAST_PATIENCE_S = 8.0, 1.25
-_FORGET = 0.95  # decay per answer of the slowest recent answer's time
 # An offset that was never measured may have any value, so its uncertainty is large.
 UNKNOWN_OFFSET = Offset(0, MAX_CAPTURE_AGE_NS)
 _REASON = re.compile(r"[a-z0-9_]{1,48}")
@@ -71,7 +62,7 @@ class Sender:
         offset: Callable[[], Offset | None],
         jitter: np.random.Generator,
         troubles: dict[str, str],
-        response_timeout_s: float = 5.0,
+        response_timeout_s: float = tuned.ANSWER_TIMEOUT_S,
     ) -> None:
         self.outbox = outbox
         self.connected = False
@@ -117,12 +108,12 @@ class Sender:
                 self.connected = False
             if self.outbox.counts["sent"] - self.outbox.counts["broken"] > answered:
                 failures = 0  # it worked for a while
-            await asyncio.sleep(backoff_s(failures, FIRST_BACKOFF_S, MAX_BACKOFF_S, self._jitter))
+            await asyncio.sleep(backoff_s(failures, tuned.FIRST_BACKOFF_S, tuned.MAX_BACKOFF_S, self._jitter))
             failures += 1
 
     async def _session(self) -> None:
         """One stream, from the moment the peer can be reached until it fails."""
-        async with asyncio.timeout(CONNECT_S):
+        async with asyncio.timeout(tuned.CONNECT_S):
             await self._channel.channel_ready()
         call = self._stub.Push(metadata=self._metadata)
         try:
@@ -144,11 +135,11 @@ class Sender:
         if self._offset_awaited:
             return
         try:
-            async with asyncio.timeout(OFFSET_WAIT_S):
+            async with asyncio.timeout(tuned.OFFSET_WAIT_S):
                 while self._offset() is None:
                     if call.done():
                         return  # the next stream waits again
-                    await asyncio.sleep(_OFFSET_POLL_S)
+                    await asyncio.sleep(tuned.OFFSET_POLL_S)
         except TimeoutError:
             pass
         self._offset_awaited = True
@@ -167,8 +158,8 @@ class Sender:
             if response.sequence != frame.sequence:
                 raise ProtocolError(f"answer to frame {response.sequence}, expected {frame.sequence}")
             answered = True
-            self._slowest_s = max(time.monotonic() - begun_s, _FORGET * self._slowest_s)
-            self._patience_s = min(max(_PATIENCE * self._slowest_s, _LEAST_PATIENCE_S), self._timeout)
+            self._slowest_s = max(time.monotonic() - begun_s, tuned.SLOWEST_ANSWER_DECAY * self._slowest_s)
+            self._patience_s = min(max(tuned.ANSWER_PATIENCE * self._slowest_s, tuned.LEAST_PATIENCE_S), self._timeout)
         except TimeoutError:
             self._patience_s = min(2.0 * patience_s, self._timeout)
             raise TimeoutError(f"no answer within {patience_s:.3g} s") from None

@@ -32,16 +32,6 @@ MAX_GAP_MS = 3.6e6
 """Longest time between a frame and its pose sample: poses an hour away belong to another recording."""
 ZJU_FPS = 50.0
 """Assumed rate of ZJU-MoCap's studio, which its files do not tell."""
-DEPTH_STEP = 0x9E3779B9
-"""2^32 by the golden ratio: shot k has depth where k * DEPTH_STEP mod 2^32 is below 2^32 / depth_every. That is one in
-depth_every shots, spread evenly (each fifth: 3, 5 or 8 apart), and also one in depth_every of each second, third, ...
-shot: a link that takes exactly so many captures a frame would never get depth if it came with each so many-th."""
-TRACKER_LOOKS_S = 0.005
-"""How often a tracker's file is looked at for lines: a quarter of the 20 ms between poses of a usual one."""
-TRACKER_LATE_S = 0.1
-"""A frame waits so long for its pose: trackers take 20 to 60 ms, and captures are 67 ms apart."""
-TRACKER_LINE_BYTES = 4096
-"""Read at once, compared again later, and longest line that is kept: one has some 100."""
 MAX_LATENCY_MS = 6e4
 """Longest latency of a camera: one that is a minute late is not live."""
 

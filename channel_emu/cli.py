@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from channel_emu import tuned_numbers as tuned
 from channel_emu.model import faults, notation
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import PRESETS
@@ -153,7 +154,11 @@ def _add_simulate(commands: Any) -> None:
         help="frame period of the cameras; Poisson arrivals then sample their newest frame, as live",
     )
     sub.add_argument(
-        "--frame-bytes", type=int, default=20_000, metavar="N", help="size of a frame, for bandwidth [%(default)s]"
+        "--frame-bytes",
+        type=int,
+        default=tuned.FRAME_BYTES,
+        metavar="N",
+        help="size of a frame, for bandwidth [%(default)s]",
     )
     sub.add_argument(
         "--csv",

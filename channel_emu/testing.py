@@ -35,6 +35,7 @@ import threading
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
+from channel_emu import tuned_numbers as tuned
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.report import Report, show
 from channel_emu.model.settings import ChannelConfig, channel_from_mapping
@@ -43,7 +44,6 @@ from channel_emu.pytest_plugin import channel
 __all__ = ["EmulatedLink", "channel"]
 
 T = TypeVar("T")
-_PATIENCE_S = 30.0
 
 
 class EmulatedLink:
@@ -81,10 +81,10 @@ class EmulatedLink:
         EmulatorFailed if the proxy failed."""
         return self._last or self._await(self._report(checked=True))
 
-    def settle(self, timeout_s: float = 10.0) -> Report:
+    def settle(self, timeout_s: float = tuned.SETTLE_S) -> Report:
         """Wait until no message is inside the link, then report. Raises TimeoutError, EmulatorFailed."""
         try:
-            self._await(asyncio.wait_for(self._proxy.settled(), timeout_s), timeout_s + _PATIENCE_S)
+            self._await(asyncio.wait_for(self._proxy.settled(), timeout_s), timeout_s + tuned.PATIENCE_S)
         except TimeoutError:
             inside = self.report().in_flight
             raise TimeoutError(f"{inside} messages are still inside the link after {timeout_s:g} s") from None
@@ -117,12 +117,12 @@ class EmulatedLink:
             self._proxy.check()
         return self._proxy.report()
 
-    def _await(self, work: Coroutine[Any, Any, T], patience_s: float = _PATIENCE_S) -> T:
+    def _await(self, work: Coroutine[Any, Any, T], patience_s: float = tuned.PATIENCE_S) -> T:
         return asyncio.run_coroutine_threadsafe(work, self._loop).result(patience_s)
 
     def _end(self) -> None:
         self._loop.call_soon_threadsafe(self._loop.stop)
-        self._thread.join(_PATIENCE_S)
+        self._thread.join(tuned.PATIENCE_S)
         self._loop.close()
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from camera_node.doctor import tuned_numbers as tuned
 from camera_node.settings import LiveConfig, SourceConfig
 from camera_node.sources.base import Source
 from camera_node.sources.registry import open_sources
 from freshfield.coverage import Camera, plan_svg, reached, reckon
 from freshfield.scenario import Scenario
-
-_TICKS = (0, 7, 30)  # whose shots tell whether a camera moves that never repeats one
 
 
 def check(scenario: Scenario, config: SourceConfig, data: Path | None, plan: Path | None) -> str:
@@ -62,5 +61,5 @@ def _fixed_cameras(scenario: Scenario, config: SourceConfig, data: Path | None) 
 def _compared(source: Source) -> Sequence[int]:
     """Numbers of the shots whose poses are compared: up to three, spread over those that repeat."""
     if source.contents is None:
-        return [source.content(tick) for tick in _TICKS]
+        return [source.content(tick) for tick in tuned.COVERAGE_TICKS]
     return range(0, source.contents, -(-source.contents // 3))

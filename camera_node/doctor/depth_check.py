@@ -78,7 +78,7 @@ def check(view: DepthView, others: Sequence[DepthView]) -> str:
     said = f"{counts.shape[1]} x {counts.shape[0]}, {1.0 - measured.mean():.0%} without depth"
     if measured.mean() < tuned.DEPTH_LEAST_MEASURED:
         raise ValueError(f"{said}: is the scene within the sensor's range and lit, is the lens free?")
-    near, middle, far = np.quantile(meters[measured], (0.05, 0.5, 0.95))
+    near, middle, far = np.quantile(meters[measured], tuned.DEPTH_QUANTILES)
     said += f", {near:.2g} to {far:.2g} m"
     if np.bincount(counts[measured]).max() > tuned.DEPTH_CONSTANT * measured.sum():
         raise ValueError(f"{said}: nearly all of it is the same, {middle:.3g} m: does the sensor measure at all?")

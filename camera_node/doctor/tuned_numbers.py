@@ -8,7 +8,11 @@ LISTEN_AT_MOST_S = 3.0  # to a slow camera
 JUDGED_FRAMES = 5  # least number of expected frames for judging the rate; with fewer, chance decides
 LEAST_RATE = 0.6
 
+# --- what fixed cameras see ---
+COVERAGE_TICKS = (0, 7, 30)  # whose shots tell whether a camera moves that never repeats one
+
 # --- a camera's depth ---
+DEPTH_QUANTILES = (0.05, 0.5, 0.95)  # the first and the last are said, the middle one tells whether the unit is wrong
 DEPTH_MOST_POINTS = 4000  # of a camera's that are looked for: the share that agrees is then known to a percent
 DEPTH_FEWEST_POINTS, DEPTH_FEWEST_EDGES = 100, 200  # of which anything is said
 DEPTH_SAME = 0.05  # relative difference of depths of one surface: the errors of sensors and poses are 1 to 2 %

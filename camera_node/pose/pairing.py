@@ -12,6 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
+from camera_node import tuned_numbers as tuned
 from freshfield.geometry import Array
 
 T = TypeVar("T")
@@ -42,8 +43,8 @@ class SampleBuffer(Generic[T]):
         self,
         interpolate: Interpolate[T] | None,
         max_gap_ns: int = 50_000_000,
-        keep_ns: int = 2_000_000_000,
-        restart_after: int = 8,
+        keep_ns: int = tuned.KEPT_POSES_NS,
+        restart_after: int = tuned.RESTART_POSES,
     ) -> None:
         self.received = 0
         self._interpolate = interpolate

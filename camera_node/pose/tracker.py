@@ -14,9 +14,9 @@ import threading
 import time
 from pathlib import Path
 
+from camera_node import tuned_numbers as tuned
 from camera_node.pose.pairing import PoseGapError, SampleBuffer
 from camera_node.pose.providers import read_sample
-from camera_node.settings import TRACKER_LATE_S, TRACKER_LINE_BYTES, TRACKER_LOOKS_S
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.geometry import Pose
 
@@ -40,8 +40,8 @@ class TrackerPoses:
     def at(self, t_ns: int) -> tuple[Pose, int]:
         """The pose at an instant, and the time (ns) to the nearest sample. Waits for a later sample, because a tracker
         computes: up to ``TRACKER_LATE_S``. Raises PoseGapError."""
-        until = time.monotonic() + TRACKER_LATE_S
-        while not self._samples.ready(t_ns) and time.monotonic() < until and not self._stop.wait(TRACKER_LOOKS_S):
+        until = time.monotonic() + tuned.TRACKER_LATE_S
+        while not self._samples.ready(t_ns) and time.monotonic() < until and not self._stop.wait(tuned.TRACKER_LOOKS_S):
             pass
         try:
             return self._samples.at(t_ns)
@@ -51,10 +51,10 @@ class TrackerPoses:
     def close(self) -> None:
         """End the thread."""
         self._stop.set()
-        self._thread.join(2.0)
+        self._thread.join(tuned.TRACKER_JOIN_S)
 
     def _main(self) -> None:
-        while not self._stop.wait(TRACKER_LOOKS_S):
+        while not self._stop.wait(tuned.TRACKER_LOOKS_S):
             with contextlib.suppress(OSError):  # it is not there yet, or its disk failed: looked for again
                 self._follow()
 
@@ -68,15 +68,15 @@ class TrackerPoses:
             while not self._stop.is_set():
                 data = b""
                 with contextlib.suppress(BlockingIOError):  # a pipe whose writer has nothing to say
-                    data = os.read(file, TRACKER_LINE_BYTES)
+                    data = os.read(file, tuned.TRACKER_LINE_BYTES)
                 if is_file and os.pread(file, len(last), taken - len(last)) != last:
                     return
-                taken, last = taken + len(data), (last + data)[-TRACKER_LINE_BYTES:]
+                taken, last = taken + len(data), (last + data)[-tuned.TRACKER_LINE_BYTES :]
                 *lines, rest = (rest + data).split(b"\n")
-                rest = rest[-TRACKER_LINE_BYTES:]
+                rest = rest[-tuned.TRACKER_LINE_BYTES :]
                 for line in lines:
                     self._add(line)
-                if os.stat(self.path).st_ino != opened.st_ino or (not data and self._stop.wait(TRACKER_LOOKS_S)):
+                if os.stat(self.path).st_ino != opened.st_ino or (not data and self._stop.wait(tuned.TRACKER_LOOKS_S)):
                     return
         finally:
             os.close(file)

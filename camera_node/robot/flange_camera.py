@@ -20,12 +20,12 @@ from camera_node.pose.providers import PoseGapError, PoseProvider
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, load_hand_eyes
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller import TRUTH_PORT
+from camera_node.robot.simulated_controller import tuned_numbers as tuned
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from camera_node.settings import ArmConfig
 from freshfield.geometry import Array, Pose
 from freshfield.scenario import Scenario
 
-_TIMEOUT_S = 1.0
 _MAX_OFFSET_NS = 2 * round(STEP_S * 1e9)  # between the requested instant and the arm's answer
 
 
@@ -46,7 +46,7 @@ class TruthClient:
     def _ask(self, t_ns: int) -> Array:
         try:
             if self._link is None:
-                with socket.create_connection((self.host, TRUTH_PORT), _TIMEOUT_S) as connected:
+                with socket.create_connection((self.host, TRUTH_PORT), tuned.TRUTH_TIMEOUT_S) as connected:
                     file = connected.makefile("rwb", buffering=0)
                 self._link = file, io.BufferedReader(file)
             requests, answers = self._link

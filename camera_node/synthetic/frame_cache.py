@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 
 import freshfield.geometry
+from camera_node import tuned_numbers as tuned
 from freshfield import payload
 from freshfield.files import write_bytes
 
-MAX_DISK_BYTES = 2 << 30  # here, since what settings.py says is part of the key of rendered frames
 _NAME = re.compile("[0-9a-f]{32}")  # name of the folder of one camera's frames
 _pruned: set[Path] = set()  # roots that this process has pruned
 # Files of this package that do not influence what an image looks like.
@@ -64,7 +64,7 @@ class FrameCache:
             self._folder.mkdir(parents=True, exist_ok=True)
             if self._root not in _pruned:  # looking through all folders takes as long as a few frames
                 _pruned.add(self._root)
-                prune(self._root, self._folder, MAX_DISK_BYTES)
+                prune(self._root, self._folder, tuned.RENDERED_DISK_BYTES)
             # Other processes may write the same frame: it is replaced as a whole, by equal bytes.
             write_bytes(self._path(frame), data)
         except OSError as error:

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.synthetic import tuned_numbers as tuned
 from camera_node.synthetic.placement import MovingBody, PlacedParts
 from camera_node.synthetic.textures import Color
 from freshfield.geometry import Array
-
-# Contact shadows end at this distance (meters) from the body's middle, and take away at most this share.
-_REACH_M, _MOST_DARKENING = 0.8, 0.75
 
 
 @dataclass(frozen=True)
@@ -66,7 +64,7 @@ def contact_shadow(
     spheres = np.array([[*placed.matrices[k, :3, 3], r] for k, r in body.contact])
     middle = spheres[:, :2].mean(axis=0)
     dx, dy = floor_points[0] - middle[0], floor_points[1] - middle[1]
-    away2 = (dx * dx + dy * dy) / _REACH_M**2
+    away2 = (dx * dx + dy * dy) / tuned.CONTACT_REACH_M**2
     near = np.flatnonzero(away2 < 1.0)
     p = floor_points[:, near]
     covered = np.zeros(near.size)
@@ -76,5 +74,5 @@ def contact_shadow(
         d2 = (p[0] - x) ** 2 + (p[1] - y) ** 2 + h * h
         covered += r * r * h / (d2 * np.sqrt(d2))
     # The window makes the truncation at the reach invisible.
-    shadow = np.minimum(covered, _MOST_DARKENING) * (1.0 - away2[near])
+    shadow = np.minimum(covered, tuned.CONTACT_MOST_DARKENING) * (1.0 - away2[near])
     return near, (1.0 - shadow).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Numbers of synthetic worlds, and the parameters that every scene has."""
+"""The parameters that every scene has."""
 
 from __future__ import annotations
 
@@ -8,16 +8,10 @@ from typing import Annotated
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.settings import Settings, within
 
-WORLD_FPS = 15.0
-"""Captures a second of a synthetic world where a scenario gives no rate."""
-WORLD_MAX_FRAMES = 3000
-"""A synthetic sequence with more different frames counts as not repeating: rendered on demand and not kept."""
 MAX_SPEED_M_PER_S = 8.0
 """Of what moves."""
 MAX_CAMERAS = 19
 """Of a scene, with the held-out one."""
-SHADOW_BIAS = 2e-3
-"""Shadow rays end this share of their length before the surface, so that it does not shadow itself."""
 Fov = Annotated[float, within(5.0, 150.0, "horizontal field of view of the cameras")]
 
 

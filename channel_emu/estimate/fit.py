@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from channel_emu.estimate import tuned_numbers as tuned
 from channel_emu.estimate import two_states
 from channel_emu.estimate.recording import (
     MAX_DELAY_MS,
@@ -28,21 +29,7 @@ from channel_emu.estimate.two_states import Segments, TwoStates
 from channel_emu.model.settings import channel_from_mapping
 from freshfield.scenario import ScenarioError
 
-MIN_DELAYS = 20
-SAMPLES = 40
-"""Bootstrap samples."""
 _Z_95 = 1.959964
-# A state with fewer frames or fewer visits counts as outliers.
-_MIN_FRAMES, _MIN_VISITS = 10.0, 3.0
-# Exponential gaps are within a quarter of their median with probability .17, a periodic camera's nearly always.
-_NEAR_MEDIAN, _PERIODIC_SHARE = 0.25, 0.5
-_CONSTANT_CV = 0.01
-# Kolmogorov-Smirnov distance times sqrt(n) to the delays that the fit draws: the 1 % level, with a margin.
-_MISFIT = 2.0
-# With a larger standard deviation of its logarithm (an interval of e^10 each way) a parameter has no interval.
-_MAX_LOG_SD = 5.0
-# Searches begin with sojourns of so many frames, on so many segments.
-_START_FRAMES, _START_STEPS, _START_SEGMENTS = (5, 50, 500), 8, 80
 
 Interval = tuple[float, float] | None
 
@@ -114,7 +101,9 @@ class _Candidate:
     model: TwoStates
 
 
-def fit(path: Path, states: str = "auto", *, discipline: str | None = None, samples: int = SAMPLES) -> Fit:
+def fit(
+    path: Path, states: str = "auto", *, discipline: str | None = None, samples: int = tuned.BOOTSTRAP_SAMPLES
+) -> Fit:
     """Fit a channel to the recording in ``path`` (``recording`` describes the format).
 
     states: number of states: "1", "2" or "auto" (BIC decides).
@@ -126,7 +115,7 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, samp
         raise RecordingError(f"--states {states}: expected 1, 2 or auto")
     recording = read_recording(path, discipline)
     delays_ms = _usable_delays_ms(recording)
-    constant = float(delays_ms.std()) <= _CONSTANT_CV * float(delays_ms.mean())
+    constant = float(delays_ms.std()) <= tuned.CONSTANT_CV * float(delays_ms.mean())
     sent = transmissions(recording)
     _, delay_ms, lost = sent
     loses = bool((lost == 1.0).any())
@@ -175,11 +164,11 @@ def fit(path: Path, states: str = "auto", *, discipline: str | None = None, samp
 
 def _usable_delays_ms(recording: Recording) -> NDArray[np.float64]:
     delays_ms = recording.delays_ms()
-    if len(delays_ms) < MIN_DELAYS:
+    if len(delays_ms) < tuned.MIN_DELAYS:
         came = sum(int(camera.delivered().sum()) for camera in recording.cameras)
         raise RecordingError(
             f"{recording.path}: {len(delays_ms)} delays below {MAX_DELAY_MS:g} ms ({recording.frames} frames, {came} "
-            f"came); at least {MIN_DELAYS} are needed, and hundreds for two states: record longer"
+            f"came); at least {tuned.MIN_DELAYS} are needed, and hundreds for two states: record longer"
         )
     return delays_ms
 
@@ -226,18 +215,19 @@ def _two_states(data: Segments, delays_ms: NDArray[np.float64], lost: NDArray[np
     """The most likely model of two states: a few steps from several models on the first part of the data, then from
     the best of them to the maximum."""
     mean_ms, loss, shape = _one_state_parameters(delays_ms, lost, law)
-    head = data.head(_START_SEGMENTS)
+    head = data.head(tuned.START_SEGMENTS)
     frames = max(int((~np.isnan(data.lost) | ~np.isnan(data.delay_ms)).sum()), 1)
     between_ms = max(float(data.span_ms.sum()) / frames, 1e-9)
-    contrasts = [(0.6, 1.6), (1.6, 0.6)] if loss and law != "constant" else [(0.6, 1.6)]
-    starts = [(n, contrast) for n in _START_FRAMES for contrast in contrasts]
+    one = tuned.START_CONTRAST
+    contrasts = [one, one[::-1]] if loss and law != "constant" else [one]
+    starts = [(n, contrast) for n in tuned.START_FRAMES for contrast in contrasts]
     begin = TwoStates(
         np.array([[1 / (n * between_ms)] * 2 for n, _ in starts]),
-        max(mean_ms, two_states.MIN_DELAY_MS) * np.array([[0.6, 1.6]] * len(starts)),
-        np.minimum(loss * np.array([contrast for _, contrast in starts]), 0.99),
+        max(mean_ms, two_states.MIN_DELAY_MS) * np.array([one] * len(starts)),
+        np.minimum(loss * np.array([contrast for _, contrast in starts]), tuned.START_MOST_LOSS),
         np.full(len(starts), shape),
     )
-    tried, value = two_states.maximize(begin, head, law, _START_STEPS)
+    tried, value = two_states.maximize(begin, head, law, tuned.START_STEPS)
     model, log_likelihood = two_states.maximize(tried.take([int(np.argmax(value))]), data, law)
     free = 2 + 2 * (law != "constant") + (law == "gamma") + 2 * bool(loss)
     bic = free * math.log(len(lost)) - 2 * float(log_likelihood[0])
@@ -254,11 +244,11 @@ def _reject_two_states(found: _Candidate, data: Segments, sent: Transmissions) -
     start_ms, _, _ = sent
     second = _second_state(found, data, len(start_ms))
     frames = min(float(second.sum()), float((1 - second).sum()))
-    if frames < _MIN_FRAMES:
+    if frames < tuned.MIN_FRAMES:
         return f"one of them rests on {frames:.0f} frames"
     span_ms = float(start_ms[-1] - start_ms[0])
     visits = float(found.model.leave_per_ms[0, 0] * found.model.stationary()[0, 0]) * span_ms
-    if visits < _MIN_VISITS:
+    if visits < tuned.MIN_VISITS:
         return f"the chain changed state {2 * visits:.0f} times only: record longer"
     return None
 
@@ -276,7 +266,7 @@ def _with_intervals(
         mean_ms, loss, shape = np.array(each).T
         again = TwoStates(np.ones((count, 2)), np.stack([mean_ms] * 2, 1), np.stack([loss] * 2, 1), shape)
     else:
-        again = two_states.maximize(model.take([0] * count), many, law, 40)[0]
+        again = two_states.maximize(model.take([0] * count), many, law, tuned.SAMPLE_STEPS)[0]
     values, samples = (_named(each, chosen.states, law) for each in (model, again))
     drawn_ms = np.empty(0)
     if law == "constant":
@@ -295,7 +285,7 @@ def _with_intervals(
 
 def _named(model: TwoStates, states: int, law: str) -> dict[str, NDArray[np.float64]]:
     """The parameters of each sample by name; a loss of nearly nothing is none."""
-    loss = np.where(model.loss < 1e-6, 0.0, model.loss)
+    loss = np.where(model.loss < tuned.NO_LOSS, 0.0, model.loss)
     pairs = {"mu{}_per_ms": model.leave_per_ms, "mean_{}_ms": model.mean_ms, "loss_{}": loss}
     if states == 1:
         found = {"mean_ms": model.mean_ms[:, 0], "loss": loss[:, 0]}
@@ -311,7 +301,7 @@ def _interval(value: float, samples: NDArray[np.float64], chance: bool) -> Inter
     if value <= 0.0:
         return None if chance else (value, value)
     reach = _Z_95 * float(np.log(np.maximum(samples, 1e-300)).std())
-    if not reach < _Z_95 * _MAX_LOG_SD:
+    if not reach < _Z_95 * tuned.MAX_LOG_SD:
         return None
     return value * math.exp(-reach), min(value * math.exp(reach), 1.0 if chance else math.inf)
 
@@ -322,7 +312,7 @@ def _misfit_warnings(delays_ms: NDArray[np.float64], drawn_ms: NDArray[np.float6
     below = np.searchsorted(drawn, ordered, side="right") / len(drawn)
     n = len(ordered)
     distance = max((np.arange(1, n + 1) / n - below).max(), (below - np.arange(n) / n).max())
-    if distance * math.sqrt(n) <= _MISFIT:
+    if distance * math.sqrt(n) <= tuned.MISFIT:
         return []
     return [
         f"the delays are not exponential or gamma by state (their distribution differs by {distance:.3f}): the means "
@@ -338,8 +328,8 @@ def _arrivals(recording: Recording) -> tuple[str, float]:
     median = float(np.median(gaps))
     if recording.sampled:
         return "poisson", median
-    near = np.abs(gaps - median) <= _NEAR_MEDIAN * median
-    return ("periodic" if near.mean() > _PERIODIC_SHARE else "poisson"), median
+    near = np.abs(gaps - median) <= tuned.NEAR_MEDIAN * median
+    return ("periodic" if near.mean() > tuned.PERIODIC_SHARE else "poisson"), median
 
 
 def _arrival_rate(recording: Recording) -> IntervalEstimate:

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from channel_emu.estimate import tuned_numbers as tuned
 from channel_emu.model import trace
 from channel_emu.model.link import EventKind
 from channel_emu.model.nanoseconds import NEVER_NS
@@ -34,7 +35,6 @@ MAX_DELAY_MS = 1e9
 LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
 _NEVER_SENT = frozenset(map(str, (EventKind.DROPPED_BUSY, EventKind.SUPERSEDED, EventKind.SKIPPED)))
 _MAX_ROWS_MS = 1e12
-_MOST_OVERLAPPING = 0.02  # tolerated share of frames that seem to be offered to a busy drop-new link
 
 
 class RecordingError(ValueError):
@@ -185,7 +185,7 @@ def _check_drop_new(recording: Recording) -> None:
         came += len(offered)
         meanwhile += int((offered[1:] < free[:-1]).sum())
     share = meanwhile / max(came, 1)
-    if share > _MOST_OVERLAPPING:
+    if share > tuned.MOST_OVERLAPPING:
         raise RecordingError(
             f"{recording.path}: {100 * share:.0f} % of the frames that came were offered while another was "
             "on its way, and a drop-new link drops those: say what this one does, --discipline newest-waits, "

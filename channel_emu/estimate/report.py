@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from channel_emu.estimate import tuned_numbers as tuned
 from channel_emu.estimate.fit import Fit, IntervalEstimate
 from freshfield.files import write_bytes
 from freshfield.untrusted import YamlWriter
-
-_MAX_FRAMES = 2000
 
 
 def format_fit(fit: Fit) -> str:
@@ -56,7 +55,7 @@ def plot(fit: Fit, path: Path) -> None:
         raise ValueError("a picture needs matplotlib: pip install 'freshfield[emu]'") from None
     cameras, two = fit.recording.cameras, fit.states == 2
     start_s = np.concatenate([c.started_ms for c in cameras]) / 1e3
-    order = np.argsort(start_s, kind="stable")[:_MAX_FRAMES]  # frames that did not start come last
+    order = np.argsort(start_s, kind="stable")[: tuned.DRAWN_FRAMES]  # frames that did not start come last
     start_s, delay_ms = start_s[order], np.concatenate([c.delay_ms for c in cameras])[order]
     figure = Figure(figsize=(9, 3 + 1.5 * two), layout="constrained")
     FigureCanvasAgg(figure)

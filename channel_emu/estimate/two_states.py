@@ -5,7 +5,7 @@ the state's mean and one shape for both states (1: exponential), and whether it 
 instants; between them the chain moves by exp(Q u) (6.27), and the expected jumps and times in the states, given
 both ends of a span, have closed forms (Hobolth and Jensen, Stat. Appl. Genet. Mol. Biol. 4(1), 2005).
 
-Recordings are cut into segments of SEGMENT frames, taken as independent, so that the recursions run over all
+Recordings are cut into segments of SEGMENT_FRAMES frames, taken as independent, so that the recursions run over all
 segments, and over all bootstrap samples, at once. Arrays have the axes (samples R, segments B, frames L, states 2).
 """
 
@@ -17,17 +17,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from channel_emu.estimate import tuned_numbers as tuned
+
 Array = NDArray[np.float64]
 
-SEGMENT = 256
-MIN_SHAPE, MAX_SHAPE = 0.05, 1e4
 _MIN_RATE, _MAX_RATE = 1e-12, 1e6
 MIN_DELAY_MS = 1e-6
 _LEAST = 1e-80
 """Least probability of a state, so that no scale under- or overflows."""
-_MOST_STEPS, _TOLERANCE, _MAX_REACH = 100, 3e-3, 64.0
-# Frames of all samples together that are computed at once: some 200 MB.
-_MOST_AT_ONCE = 500_000
 
 
 @dataclass(frozen=True)
@@ -82,7 +79,7 @@ class TwoStates:
 def segments(frames: tuple[Array, Array, Array], hides_lost: bool) -> Segments:
     """Cut frames (start_ms, delay_ms, lost), in the order of their starts, into one sample of segments."""
     start, delay_ms, lost = frames
-    length = min(SEGMENT, len(start))
+    length = min(tuned.SEGMENT_FRAMES, len(start))
     span_ms = np.diff(start, prepend=start[0])
     span_ms[::length] = 0.0
     filled = ((span_ms, 0.0), (np.maximum(delay_ms, MIN_DELAY_MS), np.nan), (lost, np.nan))
@@ -122,15 +119,15 @@ def step(model: TwoStates, data: Segments, law: str) -> tuple[TwoStates, Array, 
     return TwoStates(np.clip(leave, _MIN_RATE, _MAX_RATE), mean, loss, shape), log_likelihood, second
 
 
-def maximize(model: TwoStates, data: Segments, law: str, steps: int = _MOST_STEPS) -> tuple[TwoStates, Array]:
+def maximize(model: TwoStates, data: Segments, law: str, steps: int = tuned.MOST_STEPS) -> tuple[TwoStates, Array]:
     """Take steps until they gain no sample's likelihood anything, at most three times ``steps``. Returns the models
     and their log likelihoods (R,).
 
     Two steps show where further ones lead; the leap there (SQUAREM: Varadhan and Roland, Scand. J. Stat. 35(2), 2008)
     is taken back for a sample that it leaves less likely.
     """
-    if model.shape.size > 1 and data.lost.size > _MOST_AT_ONCE:
-        at_once = max(1, _MOST_AT_ONCE // data.lost[0].size)
+    if model.shape.size > 1 and data.lost.size > tuned.MOST_AT_ONCE:
+        at_once = max(1, tuned.MOST_AT_ONCE // data.lost[0].size)
         parts = [slice(n, n + at_once) for n in range(0, model.shape.size, at_once)]
         apart = [maximize(model.take(part), data.take(part), law, steps) for part in parts]
         columns = zip(*((m.leave_per_ms, m.mean_ms, m.loss, m.shape) for m, _ in apart))
@@ -145,12 +142,12 @@ def maximize(model: TwoStates, data: Segments, law: str, steps: int = _MOST_STEP
         moved = _vector(first) - begin
         bent = _vector(second) - begin - 2 * moved
         size = [np.linalg.norm(v, axis=1, keepdims=True) for v in (moved, bent)]
-        reach = np.clip(size[0] / np.maximum(size[1], 1e-300), 1.0, _MAX_REACH)
+        reach = np.clip(size[0] / np.maximum(size[1], 1e-300), 1.0, tuned.MAX_REACH)
         after, reached, _ = step(_model(begin + 2 * reach * moved + reach**2 * bent), part, law)
         gained = reached >= log_likelihood
         found[open_] = np.where(gained[:, None], _vector(after), _vector(second))
         best[open_] = np.maximum(log_likelihood, reached)
-        open_ = open_[np.abs(reached - log_likelihood) >= _TOLERANCE]
+        open_ = open_[np.abs(reached - log_likelihood) >= tuned.TOLERANCE]
         if not len(open_):
             break
     return _model(found), best
@@ -166,7 +163,7 @@ def _vector(model: TwoStates) -> Array:
 def _model(vector: Array) -> TwoStates:
     values = np.exp(np.clip(vector, -30.0, 30.0))
     loss = values[:, 4:6] / (1 + values[:, 4:6])
-    return TwoStates(values[:, :2], values[:, 2:4], loss, np.clip(values[:, 6], MIN_SHAPE, MAX_SHAPE))
+    return TwoStates(values[:, :2], values[:, 2:4], loss, np.clip(values[:, 6], tuned.MIN_SHAPE, tuned.MAX_SHAPE))
 
 
 def draw(model: TwoStates, data: Segments, samples: int, rng: np.random.Generator) -> Segments:
@@ -193,7 +190,7 @@ def gamma_shape(spread: Array) -> Array:
     """Shape of a gamma distribution whose mean's logarithm exceeds the mean logarithm by ``spread``, within 1.5 %
     (Minka, Estimating a gamma distribution, 2002)."""
     s = np.maximum(spread, 1e-9)
-    return np.clip((3.0 - s + np.sqrt((s - 3.0) ** 2 + 24.0 * s)) / (12.0 * s), MIN_SHAPE, MAX_SHAPE)
+    return np.clip((3.0 - s + np.sqrt((s - 3.0) ** 2 + 24.0 * s)) / (12.0 * s), tuned.MIN_SHAPE, tuned.MAX_SHAPE)
 
 
 def log_density(delay_ms: Array, mean_ms: Array, shape: Array) -> Array:

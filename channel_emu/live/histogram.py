@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from channel_emu.live import tuned_numbers as tuned
+
 _PER_DECADE = 100  # bins of 2.3 %
 _DECADES = 9  # 100 ns to 100 s
 _FLOOR_MS = 1e-4
@@ -57,10 +59,10 @@ class Histogram:
         found = {f"p{p}": self.percentile_ms(p) for p in (50, 95, 99)}
         return {"mean": self.mean_ms, **found, "max": self.max_ms if self.count else None}
 
-    def linear(self, count: int = 50) -> tuple[list[float], list[float]]:
-        """The histogram in ``count`` equal bins up to the 99.5th percentile, for drawing: edges (count + 1,)
+    def linear(self, count: int = tuned.DRAWN_BINS) -> tuple[list[float], list[float]]:
+        """The histogram in ``count`` equal bins up to the percentile ``DRAWN_PERCENT``, for drawing: edges (count + 1,)
         in ms, and counts (count,); both empty without durations."""
-        top = self.percentile_ms(99.5)
+        top = self.percentile_ms(tuned.DRAWN_PERCENT)
         if not top:
             return [], []
         edges = np.linspace(0.0, top, count + 1)

@@ -13,7 +13,7 @@ import ctypes
 import os
 import platform
 
-from channel_emu.live.tuned_numbers import SLICE_NS
+from channel_emu.live.tuned_numbers import RETURNED_BYTES, SLICE_NS
 
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _M_MMAP_THRESHOLD = -3
@@ -50,7 +50,7 @@ def return_freed_memory() -> None:
     """Make the C library return freed blocks of 1 MB and more to the system. By default it keeps blocks up to
     the size of the largest ever freed: after many 8 MB messages, hundreds of MB."""
     with contextlib.suppress(OSError, AttributeError):  # not glibc
-        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, 1 << 20)
+        ctypes.CDLL(None).mallopt(_M_MMAP_THRESHOLD, RETURNED_BYTES)
 
 
 def _shorten_slice() -> bool:

@@ -177,7 +177,7 @@ class Proxy(grpc.GenericRpcHandler):
         """Wait until no message is inside a link or being handed on. Raises EmulatorFailed."""
         while any(link.model.in_flight for link in self.links.values()) or self.pending:
             self.check()
-            await asyncio.sleep(0.002)
+            await asyncio.sleep(tuned.SETTLED_POLL_S)
 
     def report(self) -> Report:
         """Outcomes, ages and delays so far."""

@@ -2,7 +2,8 @@
 
 TCP repairs what a network does, so here losses cost time: a piece that the link loses or damages is sent again after a
 timeout, and what came after it waits. Each direction has one link, of discipline fcfs, for all connections: they share
-its capacity. A sender is read no further than BEHIND pieces ahead of what has arrived, as a receiver's window does it.
+its capacity. A sender is read no further than PIECES_BEHIND pieces ahead of what has arrived, as a receiver's window
+does it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 import grpc.aio
 from msgspec.structs import replace
 
+from channel_emu.live import tuned_numbers as tuned
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.live_link import Flips, LiveLink, Message
 from channel_emu.live.proxy import Proxy, ProxyOptions
@@ -24,15 +26,6 @@ from channel_emu.model.settings import ChannelConfig
 from freshfield.transport import TransportError, host_port
 
 log = logging.getLogger("channel-emu")
-
-PIECE_BYTES = 16_384
-"""Largest piece: each takes one service time of the channel."""
-BEHIND = 8
-"""Pieces of a direction of a connection inside the link."""
-TIMEOUT_S = 0.2
-"""After which a lost piece is sent again: the least of TCP's implementations (RFC 6298 asks for 1 s at first)."""
-MOST_CONNECTIONS = 256
-_CONNECT_TIMEOUT_S = 10.0
 
 
 class Connection:
@@ -53,7 +46,7 @@ class Connection:
 class Pipe(CallFlow):
     """One direction of one connection."""
 
-    most_ready = most_behind = BEHIND
+    most_ready = most_behind = tuned.PIECES_BEHIND
 
     def settle(self, message: Message, kind: EventKind) -> None:
         """What is lost or damaged is offered again after a while, and a copy is discarded, as TCP does it."""
@@ -62,7 +55,7 @@ class Pipe(CallFlow):
             message.duplicated = False
             super().settle(message, kind)
         elif not self._closed:
-            asyncio.get_running_loop().call_later(TIMEOUT_S, self._again, message)
+            asyncio.get_running_loop().call_later(tuned.RESEND_AFTER_S, self._again, message)
 
     def _again(self, lost: Message) -> None:
         if not self._closed:
@@ -74,7 +67,7 @@ class Pipe(CallFlow):
         """Pass on what ``reader`` brings, until its end has been passed on too."""
 
         async def read() -> Any:
-            return await reader.read(PIECE_BYTES) or grpc.aio.EOF
+            return await reader.read(tuned.PIECE_BYTES) or grpc.aio.EOF
 
         async def write(piece: bytes) -> None:
             writer.write(piece)
@@ -126,8 +119,8 @@ class TcpProxy(Proxy):
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
         assert task is not None
-        if len(self._open) >= MOST_CONNECTIONS:
-            log.warning("refused a connection: %d are open already", MOST_CONNECTIONS)
+        if len(self._open) >= tuned.MOST_CONNECTIONS:
+            log.warning("refused a connection: %d are open already", tuned.MOST_CONNECTIONS)
             writer.transport.abort()
             return
         self._open.add(task)
@@ -144,7 +137,7 @@ class TcpProxy(Proxy):
     async def _carry_both(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._connections += 1
         try:
-            async with asyncio.timeout(_CONNECT_TIMEOUT_S):
+            async with asyncio.timeout(tuned.CONNECT_TIMEOUT_S):
                 there, back = await asyncio.open_connection(*host_port(self.options.to))
         except OSError as error:  # TimeoutError is one
             log.warning("%s does not answer: %s", self.options.to, error or "timeout")

@@ -1,4 +1,4 @@
-"""Numbers of the live emulator that somebody may want to change; those of ``--tcp`` stand in ``tcp_proxy``."""
+"""Numbers of the live emulator that somebody may want to change."""
 
 MOST_CALLS = 1000  # open at once through ``channel-emu proxy``; each takes 30 kB
 MOST_METHODS = 64  # with links of their own; all others share one
@@ -19,9 +19,22 @@ WARN_AFTER_NS = 3 * 10**9  # without the edge: warn once
 EXCHANGE_TIMEOUT_S = 5.0  # of a clock exchange that is passed on
 STOP_GRACE_S = 0.5
 REFRESH_EVERY_S = 0.5  # of the status
+SETTLED_POLL_S = 0.002  # between two looks at whether no message is inside a link
+DRAWN_BINS, DRAWN_PERCENT = 50, 99.5  # of a histogram that is drawn: equal bins, up to this percentile
 KEEP_PATH_NS = 60 * 10**9  # how much of the chain's past path is kept; no event is processed later than this
 
 SWITCH_INTERVAL_S = 0.0005
 """The event loop takes the interpreter's lock back from another thread after this long at most
 (``sys.setswitchinterval``)."""
 SLICE_NS = 100_000  # a thread that asks for short slices is scheduled sooner when it wakes (Linux 6.12 and later)
+RETURNED_BYTES = 1 << 20  # freed blocks from this size on are returned to the system
+
+# --- any protocol over TCP (tcp_proxy) ---
+PIECE_BYTES = 16_384
+"""Largest piece: each takes one service time of the channel."""
+PIECES_BEHIND = 8
+"""Pieces of a direction of a connection inside the link."""
+RESEND_AFTER_S = 0.2
+"""After which a lost piece is sent again: the least of TCP's implementations (RFC 6298 asks for 1 s at first)."""
+MOST_CONNECTIONS = 256
+CONNECT_TIMEOUT_S = 10.0

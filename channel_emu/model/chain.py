@@ -12,12 +12,9 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import NDArray
 
+from channel_emu import tuned_numbers as tuned
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_round
-
-# The emulator visits every jump. A chain with more jumps a millisecond than this is refused.
-MAX_JUMPS_PER_MS = 1_000.0
-_CHECK_EVERY = 100_000
 
 
 class ChainError(ValueError):
@@ -144,7 +141,7 @@ class Chain:
     def forget(self, before_ns: int) -> None:
         """Drop the path before an instant, to bound the memory of a live chain."""
         first = bisect_right(self._starts, before_ns) - 1
-        if first < 1024:  # not worth the copy
+        if first < tuned.FORGOTTEN_JUMPS:
             return
         for i in range(first):
             self._spent_ns[self._visited[i]] += self._starts[i + 1] - self._starts[i]
@@ -155,9 +152,9 @@ class Chain:
         mark, mark_ns = self._number, self._until
         while self._until <= at_ns:
             start = self._until
-            if self._number - mark == _CHECK_EVERY:
+            if self._number - mark == tuned.CHECKED_JUMPS:
                 # The constructor's check misses this rate: e.g. fast jumps before an absorbing state.
-                if (start - mark_ns) * MAX_JUMPS_PER_MS * 10 < _CHECK_EVERY * 10**6:
+                if (start - mark_ns) * tuned.MAX_JUMPS_PER_MS * 10 < tuned.CHECKED_JUMPS * 10**6:
                     raise ChainError("the chain switches more than 10000 times a ms: slow it down")
                 mark, mark_ns = self._number, start
             target = bisect_right(self._jumps[self._visited[-1]], self._rng.pair(self._number)[1])
@@ -181,8 +178,8 @@ class Chain:
         jumps_per_ms = 0.0
         with contextlib.suppress(ChainError):
             jumps_per_ms = float(stationary(self.generator_per_ms) @ -self.generator_per_ms.diagonal())
-        if jumps_per_ms > MAX_JUMPS_PER_MS:
+        if jumps_per_ms > tuned.MAX_JUMPS_PER_MS:
             raise ChainError(
-                f"the chain would switch {jumps_per_ms:.3g} times a ms; at most {MAX_JUMPS_PER_MS:g} are "
+                f"the chain would switch {jumps_per_ms:.3g} times a ms; at most {tuned.MAX_JUMPS_PER_MS:g} are "
                 "followed: slow it down"
             )

@@ -24,6 +24,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
+from channel_emu import tuned_numbers as tuned
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.settings import ChannelConfig, channel_from_mapping
@@ -79,7 +80,7 @@ class TraceWriter:
 
     def __init__(self, path: Path, config: ChannelConfig, seed: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = path.open("wb", buffering=1 << 16)
+        self._file = path.open("wb", buffering=tuned.TRACE_BUFFER_BYTES)
         self._line({"freshfield_trace": VERSION, "seed": seed, "channel": config.to_mapping()})
 
     def write(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from channel_emu import tuned_numbers as tuned
 from channel_emu.model.ages import RunningAge, mean_of_known
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Link, Transit
@@ -20,10 +21,6 @@ from channel_emu.model.traffic import PoissonArrivals
 from freshfield.files import write_csv
 
 OUTCOMES = tuple(kind for kind in EventKind if kind not in (EventKind.STARTED, EventKind.DUPLICATED))
-# Minutes of computing, and some 10 GB.
-_MOST_FRAMES = 2e7
-_MOST_CAMERAS = 10_000  # 25 kB each, and ten times as many as a scenario has
-_DEFAULT_FRAME_PERIOD_MS = 1000 / 30
 
 
 class SimulationError(ValueError):
@@ -65,8 +62,10 @@ class Simulation:
     def ages_ms(self, every_ms: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Instants (T,) in seconds, every ``every_ms`` from 0 on, and the age (cameras, T) of each camera's newest
         arrived frame then, in milliseconds; NaN before the first. Raises SimulationError for a period out of range."""
-        if not every_ms > 0.0 or len(self.runs) * self.seconds * 1e3 / every_ms > _MOST_FRAMES:
-            raise SimulationError(f"every_ms: expected more than 0 and at most {_MOST_FRAMES:.0e} ages, got {every_ms}")
+        if not every_ms > 0.0 or len(self.runs) * self.seconds * 1e3 / every_ms > tuned.MOST_FRAMES:
+            raise SimulationError(
+                f"every_ms: expected more than 0 and at most {tuned.MOST_FRAMES:.0e} ages, got {every_ms}"
+            )
         at_ns = np.arange(0, round(self.seconds * 1e9) + 1, round(every_ms * 1e6))
         ages = np.full((len(self.runs), len(at_ns)), np.nan)
         for row, run in zip(ages, self.runs):
@@ -129,7 +128,7 @@ def simulate(
     seed: int = 0,
     *,
     frame_period_ms: float | None = None,
-    frame_bytes: int = 20_000,
+    frame_bytes: int = tuned.FRAME_BYTES,
 ) -> Simulation:
     """Run every camera's link for ``seconds`` of virtual time.
 
@@ -142,20 +141,20 @@ def simulate(
     count = cameras if isinstance(cameras, int) else len(cameras)
     names = [f"cam{i:02d}" for i in range(count)] if isinstance(cameras, int) else cameras
     for name, value, least, most in (
-        ("cameras", count, 1, _MOST_CAMERAS),
+        ("cameras", count, 1, tuned.MOST_CAMERAS),
         ("seconds", seconds, 1e-9, 1e9),
         ("frame_period_ms", 1.0 if frame_period_ms is None else frame_period_ms, 1e-3, 1e12),
         ("frame_bytes", frame_bytes, 0, MAX_SIZE_BYTES),
     ):
         if not least <= value <= most:
             raise SimulationError(f"{name}: expected {least:g} to {most:g}, got {value}")
-    period_ms = frame_period_ms or config.arrivals.period_ms or _DEFAULT_FRAME_PERIOD_MS
+    period_ms = frame_period_ms or config.arrivals.period_ms or tuned.FRAME_PERIOD_MS
     generated = config.arrivals.process == "poisson" and frame_period_ms is None
     rates = config.arrivals.rate_per_ms
     most_per_ms = (max(rates) if isinstance(rates, list) else rates or 0.0) if generated else 1 / period_ms
     frames = count * seconds * 1e3 * most_per_ms
-    if frames > _MOST_FRAMES:
-        raise SimulationError(f"about {frames:.1e} frames: expected at most {_MOST_FRAMES:.0e} in one run")
+    if frames > tuned.MOST_FRAMES:
+        raise SimulationError(f"about {frames:.1e} frames: expected at most {tuned.MOST_FRAMES:.0e} in one run")
     end_ns = round(seconds * 1e9)
     channel = Channel(config, seed)
     offers = {}
@@ -218,7 +217,9 @@ class VirtualChannel:
         self.cameras, self.seed, self.frame_period_ms = cameras, seed, frame_period_ms
         self._simulated = lru_cache(maxsize=1)(self._simulate)
 
-    def ages(self, seconds: float, every_ms: float = 10.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def ages(
+        self, seconds: float, every_ms: float = tuned.AGES_EVERY_MS
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """The sawtooth of ages: instants (T,) in seconds, and ages (cameras, T) in milliseconds, see
         ``Simulation.ages_ms``. Raises SimulationError."""
         return self.simulate(seconds).ages_ms(every_ms)

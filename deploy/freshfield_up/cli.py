@@ -16,8 +16,8 @@ from pathlib import Path
 from freshfield.scenario import ScenarioError
 from freshfield_up import check_plugin, scenario_command
 from freshfield_up.commands import MissingCommand, Options
-from freshfield_up.deployment import open_launcher
 from freshfield_up.folder import FolderError
+from freshfield_up.launcher import open_launcher
 
 EXAMPLES = """examples:
   freshfield demo                              the default scenario for a minute, page on http://127.0.0.1:8080

@@ -14,29 +14,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from freshfield import scenario as scenarios
 from freshfield.files import read_status
-from freshfield.scenario import ScenarioError
+from freshfield_up import tuned_numbers as tuned
 from freshfield_up.commands import Options
-from freshfield_up.net import LOOPBACK, free_ports, is_free
-from freshfield_up.run import Launcher, print_line
+from freshfield_up.launcher import open_launcher
+from freshfield_up.ports import LOOPBACK, free_ports
 
 
 class DeploymentError(RuntimeError):
     """The processes did not start, or one of them died; the message says which and names its log."""
-
-
-def open_launcher(scenario: str | Path, options: Options, say: Callable[[str], None] = print_line) -> Launcher:
-    """A launcher, checked and not started. scenario: file or name. say: see ``Launcher``. Raises ScenarioError."""
-    opened = scenarios.load(scenario, options.seed)
-    if not is_free(options.port):
-        raise ScenarioError(f"port {options.port} is taken by another program; choose one with --port (PORT=)")
-    if options.data is not None and not options.data.is_dir():
-        raise ScenarioError(f"{options.data}: no such folder of recorded data (--data)")
-    kind, _, file = (options.policy or "").partition(":")
-    if kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(options.out.resolve()):
-        raise ScenarioError(f"--policy {options.policy}: {options.out} is emptied first; choose another --out")
-    return Launcher(opened, options, say)
 
 
 class Deployment:
@@ -73,7 +59,7 @@ class Deployment:
         """Raises FolderError or MissingCommand where it cannot start, DeploymentError where a process fails."""
         self._thread.start()
         try:
-            while not self._launcher.ready.wait(0.1) and not self._ended.is_set():
+            while not self._launcher.ready.wait(tuned.STARTED_POLL_S) and not self._ended.is_set():
                 pass
         except BaseException:  # Ctrl-C while it starts
             self._end()

@@ -16,8 +16,8 @@ import time
 from pathlib import Path
 
 from freshfield.transport import add_arguments, from_arguments
-from freshfield_up.net import is_serving
-from freshfield_up.tuned_numbers import FRESH_S
+from freshfield_up.ports import is_serving
+from freshfield_up.tuned_numbers import FRESH_S, HEALTH_ANSWER_S
 
 
 def is_fresh(folder: Path, camera: str | None) -> bool:
@@ -34,7 +34,7 @@ def main() -> int:
     add_arguments(parser)
     args = parser.parse_args()
     healthy = (
-        is_serving(args.serving, timeout_s=2.0, transport=from_arguments(args))
+        is_serving(args.serving, timeout_s=HEALTH_ANSWER_S, transport=from_arguments(args))
         if args.serving
         else is_fresh(args.node, os.environ.get("CAMERA"))
     )

@@ -8,6 +8,9 @@ LINE_EVERY_S = 5.0  # a line for people
 SAMPLE_EVERY_S = 2.0
 """Of memory and processor time of every process, in ``processes.jsonl``."""
 
+ANSWER_S, PAGE_ANSWER_S = 0.5, 1.0  # a process, and the page, answer within it once they are ready
+HEALTH_ANSWER_S = 2.0  # the same of a container that is asked whether it is healthy
+STARTED_POLL_S = 0.1  # between two looks, from a program, at whether a deployment is ready
 READY_WITHIN_S = 600.0
 """A first start compiles the field's kernels: a minute, or more on a busy machine."""
 REPORT_WITHIN_S = 300.0

@@ -19,7 +19,7 @@ from edge_server.export.tuned_numbers import SPZ_BITS, SPZ_WHOLE_BITS
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.planar import unit_quaternions
-from edge_server.fields.splat.settings import LOG_SCALE_HIGH, LOG_SCALE_LOW
+from edge_server.fields.splat.tuned_numbers import LOG_SCALE_HIGH, LOG_SCALE_LOW
 from freshfield.files import write_bytes
 
 Y0 = 0.28209479177387814

@@ -14,13 +14,13 @@ from contextlib import contextmanager
 
 from numba.core import event
 
+from edge_server.fields.common.tuned_numbers import COMPILING_EVERY_S
+
 log = logging.getLogger(__name__)
 
 USUAL = "once a machine: usually 90 to 180 functions in 20 to 50 s"
 """Functions: 93 of ``tensorf``, 139 of ``splat`` in layers, 175 with the kernels of depth. Time of ``splat`` in layers:
 20 s on a fast core; 35 s on a slow one, 46 with the kernels of depth."""
-LOG_EVERY_S = 10.0
-"""Between two lines of the log: a long compilation shows that it goes on, and a short one is a single line."""
 
 
 class Teller(event.Listener):
@@ -56,5 +56,5 @@ def log_compilation() -> None:
     """Log, in this process and from now on, that kernels are compiled. Further calls do nothing."""
     global _log_teller
     if _log_teller is None:
-        _log_teller = Teller(log.info, LOG_EVERY_S)
+        _log_teller = Teller(log.info, COMPILING_EVERY_S)
         event.register("numba:compile", _log_teller)

@@ -19,19 +19,14 @@ from numpy.typing import NDArray
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.fields.splat.carried_camera.discs import filled
-from edge_server.surface import settings as tuned
+from edge_server.surface import tuned_numbers as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.patch_images import Images, Planes, Search, View
 from edge_server.surface.kernels.patch_match import choose_sources, confirm, match
 from freshfield.geometry import seen_from
 
-PASSES = (
-    Search(True, 4, tuned.REACH, 0.02, 0.4, 0.0),
-    Search(False, 4, tuned.REACH, 0.02, 0.4, 0.0),
-    Search(True, 4, tuned.REACH, 0.01, 0.3, 0.0),
-    Search(False, 2, tuned.REACH, 0.005, 0.2, 0.0),
-    Search(True, 0, tuned.REACH, 0.005, 0.2, 0.1),
-    Search(True, 0, tuned.REACH, 0.002, 0.1, 0.1),
+PASSES = tuple(
+    Search(choose, wide, tuned.REACH, share, turn, geometric) for choose, wide, share, turn, geometric in tuned.SEARCHES
 )
 
 
@@ -166,7 +161,8 @@ def _with_trust(found: DepthMap, view: View, planes: Planes, images: Images, poo
     pool.run(confirm, images, view, planes, tuned.CONFIRMED, agree, against, rise)
     compared = view.chosen[..., 0] >= 0
     alike = np.clip((tuned.DEAR - planes.cost) / (tuned.DEAR - tuned.CHEAP), 0.0, 1.0)
-    sure = alike * np.minimum(0.4 + 0.2 * agree, 1.0) * ((agree > 0) & (agree >= against))
+    confirmed = np.minimum(tuned.CONFIRMED_FIRST + tuned.CONFIRMED_EACH * agree, 1.0)
+    sure = alike * confirmed * ((agree > 0) & (agree >= against))
     # Images may agree by being flat; then only the field knows.
     sure = np.where(rise >= tuned.PLAIN, sure, np.minimum(sure, tuned.UNSURE))
     # What no other camera sees, and what they show flat, stays as the field has it.

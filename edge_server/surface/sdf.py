@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.surface import SurfaceError
-from edge_server.surface import settings as tuned
+from edge_server.surface import tuned_numbers as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, SIDE
 from edge_server.surface.volume import Grid, Volume, fuse_maps
@@ -82,17 +82,18 @@ def _optimize(
             values = interpolate(values, size=shape, mode="trilinear", align_corners=True)
         values = values.detach().clone().requires_grad_()
         extent = torch.tensor([(n - 1) * voxel for n in shape])
-        optimizer = torch.optim.Adam([values], lr=tuned.SDF_RATE * voxel, betas=(0.9, 0.95))
+        optimizer = torch.optim.Adam([values], lr=tuned.SDF_RATE * voxel, betas=tuned.SDF_BETAS)
         for step in range(tuned.SDF_STEPS):
             # Sample by trust; searchsorted does what multinomial would, without its limit of 2^24.
             tickets = torch.rand(tuned.SDF_POINTS, generator=generator, dtype=torch.float64)
             drawn = torch.searchsorted(chances, tickets).clamp_(max=len(chances) - 1)
             loss = _loss(values, extent, voxel, grid.band_m, points[drawn], rays[drawn], cosine[drawn], generator)
-            optimizer.param_groups[0]["lr"] = tuned.SDF_RATE * voxel * 0.1 ** (step / tuned.SDF_STEPS)
+            left = tuned.SDF_RATE_END ** (step / tuned.SDF_STEPS)
+            optimizer.param_groups[0]["lr"] = tuned.SDF_RATE * voxel * left
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
-            if say is not None and (step + 1) % 20 == 0:
+            if say is not None and (step + 1) % tuned.SDF_SAYS_EVERY == 0:
                 say("sdf", (level + (step + 1) / tuned.SDF_STEPS) / tuned.SDF_LEVELS)
     found: NDArray[np.float32] = values.detach().numpy()[0, 0]
     return found

@@ -1,69 +1,12 @@
-"""Settings of meshes, and numbers that no option sets."""
+"""Settings of meshes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from edge_server.surface import SurfaceError
 
 METHODS = ("tsdf", "sdf")
-
-# --- depth maps (depth, reconstruct) ---
-SOLID = 0.8  # minimum opacity of a ray that hits a surface
-EMPTY = 0.1  # maximum opacity of a ray that hits nothing
-EMPTY_TRUST = 0.25  # of a pixel whose ray hits nothing; 1 is a surface at normal incidence
-MAX_DEPTH_M = 1e6  # larger depths are invalid
-STEEPEST_DEG = 80.0  # maximum angle between ray and normal; beyond it is an edge, or unreliable
-GUESS = 0.5  # minimum opacity of a surface as initial depth for refinement
-FINEST = 512  # maximum voxels along the longest side without a given voxel size
-
-# --- sharpening by photo-consistency (refine_depth) ---
-SHARPENED_PIXELS = 10_000_000  # of all maps that are sharpened: seven minutes of processor time, 41 s a million
-COVERING_POINTS = 200  # of a map, by which is chosen what to sharpen
-REACH = 0.18  # how far to each side depth is searched, as a share of the initial depth
-GAIN_POINTS, LEAST_SHARED = 500, 50  # points of an image; fewest that two must share to compare brightness
-GAIN_WITHIN = 0.05  # tolerance of the initial depth, share of the distance
-SAME_GAIN, MOST_GAIN = 0.03, 0.7  # logarithms of the least and the largest correction
-SMOOTH_PX = 2.5  # sigma of the Gaussian blur for initial normals
-CONFIRMED = 0.004  # tolerance of another map's surface, share of the distance, plus one pixel
-CHEAP, DEAR = 0.3, 1.2  # trust falls from 1 to 0 between these costs of a plane
-UNSURE = 0.05  # factor of the trust of a pixel whose depth the images do not determine
-PLAIN = 0.0005  # rise of the cost a pixel's width away, below which they hardly determine it
-NOTHING = 1e-5  # ... below which they do not, and the field's depth stays
-
-# ... by PatchMatch (kernels.patch_match)
-SOURCES = 5  # images that a pixel is compared with
-SIMILAR = np.float32(15.0)  # gray levels: a tap this different weighs 1/e, so patches end at edges
-FADE = 0.1  # a tap's weight falls by exp(-FADE pixels^2)
-NOISE = np.float32(1.0)  # variance, gray levels squared, of what is no texture
-DIFFERENCE = np.float32(0.8)  # share of the difference of gray levels in the cost; the rest: 1 - correlation
-LEVELS = np.float32(4.0)  # mean difference, gray levels, that costs 1 on a plain patch; at most 2
-WORST = np.float32(3.0)  # cost of a plane that no other image shows
-SINGLE = np.float32(0.3)  # added if only one other image shows it
-MOST_PX = 3.0  # largest distance that the geometric term counts
-LEAST_COS = 0.1  # between ray and normal
-SMOOTH = np.float32(0.06)  # weight of the distance, pixels, to what neighbors' planes say; at most BUMPY_PX
-BUMPY_PX = 2.0
-BETTER = np.float32(1e-4)  # a plane replaces another if it is cheaper by this
-LEAST_DEG, BEST_DEG, SPREAD_DEG, MOST_DEG = 3.0, 25.0, 15.0, 70.0  # between two images' lines of sight
-
-# --- fusion and meshes (volume, sdf, mesh) ---
-MIN_WEIGHT = 0.2  # of a known voxel; a camera at normal incidence counts 1
-MOST_VOXELS = 1 << 27  # of the box around the blocks: 512 MB of distances, and up to 3.2 GB if all lie near a surface
-MAX_BLOCKS = 1 << 24  # in the table of blocks: 24 bytes each during fusion
-TRUNCATION = 4.0  # voxels
-FREE = 0.05  # weight factor of a voxel far before a surface; 1 at the surface
-CLOSE = 2.0  # maximum depth difference of neighboring pixels on one surface, in truncations
-OUTLIERS = 0.002  # share of points at each end of each axis
-MAX_NODES = 1 << 24  # of the distance function's finest grid
-LEAST = 1e-3  # voxels; a distance of exactly 0 puts a vertex on a voxel and makes degenerate triangles
-KEEP_SHARE = 0.002  # share of the largest component's area; smaller components are removed
-# The distance function (sdf): grids, each twice as fine as the last; Adam's steps and samples of each kind on each of
-# them, and its learning rate in voxels; lambda of (3.15), and the weight of the third term.
-SDF_LEVELS, SDF_STEPS, SDF_POINTS, SDF_RATE = 3, 60, 20_000, 0.1
-SDF_EIKONAL, SDF_SIDES = 0.1, 1.0
 
 Corner = tuple[float, float, float]
 

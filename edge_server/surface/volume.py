@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
-from edge_server.surface import settings as tuned
+from edge_server.surface import tuned_numbers as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, KernelDepth, fuse
-from edge_server.surface.settings import MOST_VOXELS
+from edge_server.surface.tuned_numbers import MOST_VOXELS
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def bounding_box(
 ) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Lower and upper corner, meters, of the maps' points without outliers, plus a margin. SurfaceError:
     there are no points."""
-    points = [m.points()[:: max(1, m.depth.size // 20000)] for m in maps]
+    points = [m.points()[:: max(1, m.depth.size // tuned.BOX_POINTS)] for m in maps]
     every = np.concatenate(points) if points else np.zeros((0, 3))
     if not len(every):
         raise SurfaceError("no camera sees anything solid: fit the field longer")

@@ -25,7 +25,7 @@ from freshfield.files import read_status
 from freshfield.scenario import ScenarioError, load
 from freshfield_up import commands, processes
 from freshfield_up import healthy as health_check
-from freshfield_up import run as launcher
+from freshfield_up import launcher as launcher
 from freshfield_up.cli import main, seconds
 from freshfield_up.commands import ProcessSet
 from freshfield_up.deployment import DeploymentError

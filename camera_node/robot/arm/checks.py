@@ -8,7 +8,7 @@ import numpy as np
 
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes, mount_on_flange
 from camera_node.robot.arm.joint_states import ArmStream
-from camera_node.robot.arm.tuned_numbers import LEAST_REACHED, LISTEN_S
+from camera_node.robot.arm.tuned_numbers import LEAST_REACHED, LEAST_STATES, LISTEN_S
 from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
 from camera_node.settings import ArmConfig, PathConfig
 from freshfield.clock import WallClock
@@ -46,7 +46,7 @@ def joint_states(arm: ArmConfig) -> str:
         stream.stop()
     if trouble:
         raise ValueError(f"{trouble}: see the teach pendant; poses are right all the same")
-    if samples < 0.8 * arm.frequency_hz:
+    if samples < LEAST_STATES * arm.frequency_hz:
         raise ValueError(
             f"{samples:.0f} joint states a second of {arm.frequency_hz:g}: is the network or this machine busy?"
         )

@@ -16,14 +16,14 @@ import numpy as np
 
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.joint_states import ArmStream, probe
-from camera_node.robot.arm.tuned_numbers import CONTROL_S, SIMULATED_STALE_S, STALE_S, STOPPING_S
+from camera_node.robot.arm.tuned_numbers import CONTROL_S, DRIVE_HZ, SIMULATED_STALE_S, STALE_S, STOPPING_S
 from camera_node.settings import ArmConfig
 from freshfield.clock import WallClock
 
 log = logging.getLogger("camera-node.arm")
 
 
-def open_stream(config: ArmConfig, frequency_hz: float = 50.0) -> ArmStream:
+def open_stream(config: ArmConfig, frequency_hz: float = DRIVE_HZ) -> ArmStream:
     """Joint-state stream of an arm that will be moved, not started yet. A simulated arm hits nothing, so its
     state may be older before it is stopped."""
     stale_s = SIMULATED_STALE_S if config.simulated else STALE_S

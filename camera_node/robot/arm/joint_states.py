@@ -28,7 +28,15 @@ from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.arm.rtde_process import SAMPLE
-from camera_node.robot.arm.tuned_numbers import BACKOFF_S, CONNECT_S, PROBE_S, STALE_S
+from camera_node.robot.arm.tuned_numbers import (
+    BACKOFF_S,
+    CONNECT_S,
+    JOIN_S,
+    NEXT_STATE_POLL_S,
+    NEXT_STATE_S,
+    PROBE_S,
+    STALE_S,
+)
 from freshfield.clock import Clock
 from freshfield.geometry import Array, Pose
 
@@ -138,7 +146,7 @@ class ArmStream:
         atexit.unregister(self.stop)
         self._end_child()
         if self._thread.is_alive():
-            self._thread.join(2.0)
+            self._thread.join(JOIN_S)
 
     def at(self, t_ns: int, wait_s: float = 0.0) -> tuple[Array, int]:
         """Joint angles (6,) at an instant, and its distance (ns) from the nearest sample. Raises
@@ -148,7 +156,7 @@ class ArmStream:
         """
         until = time.monotonic() + wait_s
         while self._interpolate and not self._samples.ready(t_ns) and time.monotonic() < until:
-            if self._stop.wait(0.001):
+            if self._stop.wait(NEXT_STATE_POLL_S):
                 break
         try:
             return self._samples.at(t_ns)
@@ -252,7 +260,9 @@ class FlangePoses:
     wait_s: longest wait for the sample after the instant, which interpolation needs.
     """
 
-    def __init__(self, stream: ArmStream, model: ArmModel, base: NDArray[np.float64], wait_s: float = 0.03) -> None:
+    def __init__(
+        self, stream: ArmStream, model: ArmModel, base: NDArray[np.float64], wait_s: float = NEXT_STATE_S
+    ) -> None:
         self._stream, self._model, self._base, self._wait_s = stream, model, base, wait_s
 
     def at(self, t_ns: int) -> tuple[Pose, int]:

@@ -16,7 +16,7 @@ import struct
 import sys
 import time
 
-from camera_node.robot.arm.tuned_numbers import CONNECT_S
+from camera_node.robot.arm.tuned_numbers import CONNECT_S, POLL_SHARE
 
 SAMPLE = struct.Struct("<d6d2i")
 """Controller's time in seconds, six joint angles in radians, robot mode, safety mode."""
@@ -42,7 +42,7 @@ def main(host: str, frequency_hz: float) -> int:
         return 1
     signal.setitimer(signal.ITIMER_REAL, 0)
     parent, last = os.getppid(), -1.0
-    pause_s = 0.25 / frequency_hz
+    pause_s = POLL_SHARE / frequency_hz
     while os.getppid() == parent:
         time.sleep(pause_s)
         if not arm.isConnected():

@@ -18,7 +18,14 @@ from numpy.typing import ArrayLike, NDArray
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.tuned_numbers import CHECKED_POSTURES, FARTHEST_RAD, MARGIN_M, TOOL_M, TOOL_RADIUS_M
+from camera_node.robot.arm.tuned_numbers import (
+    CHECKED_POSTURES,
+    FARTHEST_RAD,
+    LEAST_VIEWPOINTS,
+    MARGIN_M,
+    TOOL_M,
+    TOOL_RADIUS_M,
+)
 from camera_node.settings import PathConfig
 from freshfield.geometry import Array, on_sphere, se3, se3_inverse, so3_exp
 
@@ -59,7 +66,7 @@ def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start:
     base: world-from-base (4, 4).
     mount: flange-from-camera (4, 4).
     start: current joint angles (6,); the tour begins near them, with a viewpoint to which the path is free.
-    Raises ArmError if the arm can visit fewer than three viewpoints.
+    Raises ArmError if the arm can visit fewer than ``LEAST_VIEWPOINTS``.
     """
     poses = viewpoints(path)
     joints, places = _free_postures(arm, base, mount, path, poses)
@@ -76,7 +83,7 @@ def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start:
             tour, used = _extend_tour(arm, base, path.floor_m, joints, places, int(k))
             visited |= used
             best = max(best, tour, key=lambda each: each.reached)
-    if best.reached < 3:
+    if best.reached < LEAST_VIEWPOINTS:
         raise ArmError(
             f"the arm reaches {best.reached} of {len(poses)} viewpoints: change radius_m, elevations_deg, "
             "azimuths_deg, where the base stands, or the arm's posture before"

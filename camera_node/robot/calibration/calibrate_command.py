@@ -164,7 +164,7 @@ def _samples(args: argparse.Namespace, board: Any) -> Any:
         raise CalibrationError("--board SPEC: say what the target is")
     lens = None if args.lens is None else inputs.read_lens(args.lens)
     if args.live is not None:
-        from camera_node.robot.calibration.guided import live_samples
+        from camera_node.robot.calibration.hand_eye.guided_session import live_samples
 
         if args.camera is None:
             raise CalibrationError("--camera ID: say which of the scenario's cameras")

@@ -13,6 +13,8 @@ from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.targets import Corners
 from camera_node.robot.calibration.tuned_numbers import (
+    COVERED_CELLS,
+    LARGEST_FOCAL_STD,
     LONGEST_FOCAL,
     MIN_CORNERS,
     MIN_TILT_DEG,
@@ -92,7 +94,11 @@ def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: 
         usable = {name: c for name, c in usable.items() if name not in bad}
         lens, std, normals, errors = _solve(usable, size)
     possible = all(SHORTEST_FOCAL < f / max(size) < LONGEST_FOCAL for f in (lens.fx, lens.fy))
-    if not (np.isfinite([lens.fx, lens.fy, *lens.distortion, *std]).all() and possible and std[0] < 0.2 * lens.fx):
+    if not (
+        np.isfinite([lens.fx, lens.fy, *lens.distortion, *std]).all()
+        and possible
+        and std[0] < LARGEST_FOCAL_STD * lens.fx
+    ):
         raise CalibrationError(_UNDETERMINED)
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
     if tilt_deg < MIN_TILT_DEG:
@@ -102,8 +108,8 @@ def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: 
         )
     counts = [len(c.points) for c in usable.values()]
     error_px = float(np.sqrt(np.average(np.square(errors), weights=counts)))
-    cells = [np.clip(c.pixels / size * 6, 0, 5).astype(int) for c in usable.values()]
-    covered = len(np.unique(np.concatenate(cells), axis=0)) / 36
+    cells = [np.clip(c.pixels / size * COVERED_CELLS, 0, COVERED_CELLS - 1).astype(int) for c in usable.values()]
+    covered = len(np.unique(np.concatenate(cells), axis=0)) / COVERED_CELLS**2
     found = dict(zip(usable, errors.tolist()))
     return LensCalibration(lens, std, error_px, found, tilt_deg, covered, unused)
 

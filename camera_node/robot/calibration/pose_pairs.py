@@ -20,12 +20,12 @@ import numpy as np
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, rigid_transform
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
+from camera_node.robot.calibration.tuned_numbers import MOST_QUATERNION_ERROR
 from freshfield.geometry import quaternion_to_matrix, se3, se3_inverse
 from freshfield.untrusted import UntrustedError, read_json, read_text, read_yaml
 
 _EASY_HANDEYE = ("robot", "tracking")
 _NAMES = (("effector_wrt_world", "object_wrt_sensor"), _EASY_HANDEYE)
-_MOST_QUATERNION_ERROR = 0.01
 
 
 def read_pairs(file: Path, setup: str) -> Samples:
@@ -86,7 +86,7 @@ def read_pose(value: Any) -> Array:
         numbers = numbers.reshape(4, 4)
     if numbers.shape != (7,):
         return rigid_transform(numbers)
-    if abs(np.linalg.norm(numbers[3:]) - 1.0) > _MOST_QUATERNION_ERROR or not np.isfinite(numbers).all():
+    if abs(np.linalg.norm(numbers[3:]) - 1.0) > MOST_QUATERNION_ERROR or not np.isfinite(numbers).all():
         raise ValueError("the last four of seven numbers are no unit quaternion (qx qy qz qw)")
     return se3(quaternion_to_matrix(numbers[[6, 3, 4, 5]]), numbers[:3])
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.tuned_numbers import AMBIGUOUS, MIN_CORNERS, MIN_MARKERS
+from camera_node.robot.calibration import tuned_numbers as tuned
 from freshfield.geometry import Array, Pinhole, se3
 
 GrayImage = NDArray[np.uint8]
@@ -35,11 +35,10 @@ _DICTIONARIES = (
     "ARUCO_MIP_36H12",
 )
 _SIZES = (50, 100, 250, 1000)
-_MOST_SQUARES = 16  # across and down, of ChArUco boards that are tried
 # Corners of a chessboard that was described by its squares, or miscounted by one or two.
 _OTHER_SIZES = ((-1, -1), (1, 1), (-1, 0), (0, -1), (1, 0), (0, 1), (-2, -2), (2, 2))
 _CHESSBOARD = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
-_SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-4)
+_SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, tuned.SUBPIX_STEPS, tuned.SUBPIX_PX)
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,11 @@ def estimate_pose(corners: Corners, lens: Pinhole) -> Array:
     if not count or not np.isfinite(turns[0]).all() or shifts[0][2] <= 0:
         raise CalibrationError("the target's pose cannot be found from its corners")
     errors = np.ravel(errors)
-    if count > 1 and len(corners.points) < 12 and errors[1] < AMBIGUOUS * max(float(errors[0]), 0.05):
+    if (
+        count > 1
+        and len(corners.points) < tuned.AMBIGUOUS_CORNERS
+        and errors[1] < tuned.AMBIGUOUS * max(float(errors[0]), tuned.AMBIGUOUS_PX)
+    ):
         raise CalibrationError("the target is seen so straight on that it may be tilted either way")
     turn, shift = cv2.solvePnPRefineLM(corners.points, pixels, matrix, distortion, turns[0], shifts[0])
     return se3(cv2.Rodrigues(turn)[0], shift.ravel())
@@ -141,10 +144,10 @@ class Charuco(Target):
     def find(self, image: GrayImage) -> Corners | None:
         prints = _detect(self._detectors, image)
         counts = [len(numbers) for _, numbers in prints]
-        if max(counts) - min(counts) >= MIN_CORNERS:
+        if max(counts) - min(counts) >= tuned.MIN_CORNERS:
             self._total = [count + before for count, before in zip(counts, self._total)]
         pixels, numbers = prints[int(np.argmax(self._total if any(self._total) else counts))]
-        if len(numbers) < MIN_CORNERS:
+        if len(numbers) < tuned.MIN_CORNERS:
             return None
         points = self._places[numbers]
         if min(len(np.unique(points[:, axis].round(6))) for axis in (0, 1)) < 2:
@@ -160,23 +163,23 @@ class Charuco(Target):
 
     def explain(self, image: GrayImage) -> str:
         numbers = _markers(image, self._dictionary)
-        if len(numbers) < MIN_MARKERS:
+        if len(numbers) < tuned.MIN_MARKERS:
             return self._other_markers(image)
         across, down = self._counts
         for other in _other_boards(across, down, int(numbers.max())):
             found = _detect(_charuco_detectors(*other, self._marker, self._dictionary), image)
-            if max(len(corners) for _, corners in found) >= MIN_CORNERS:
+            if max(len(corners) for _, corners in found) >= tuned.MIN_CORNERS:
                 what = "its sizes are swapped" if other == (down, across) else "it is a board of another size"
                 return f"{what}: {other[0]}x{other[1]} squares, not {across}x{down}"
         return f"{len(numbers)} markers are seen, but not arranged like this board's"
 
     def _other_markers(self, image: GrayImage) -> str:
         """What is seen instead of this board's markers."""
-        if len(_markers(np.ascontiguousarray(image[:, ::-1]), self._dictionary)) >= MIN_MARKERS:
+        if len(_markers(np.ascontiguousarray(image[:, ::-1]), self._dictionary)) >= tuned.MIN_MARKERS:
             return "the picture is mirrored: switch that off in the camera's settings"
         seen = {name: _markers(image, name) for name in _DICTIONARIES}
         name = max(seen, key=lambda each: len(seen[each]))
-        if len(seen[name]) < MIN_MARKERS:
+        if len(seen[name]) < tuned.MIN_MARKERS:
             return "no markers are seen: is the board small, blurred, dark, or another one?"
         kind, _, largest = name.rpartition("_")
         if largest.isdigit():
@@ -220,8 +223,13 @@ def _dictionary(name: str) -> cv2.aruco.Dictionary:
 
 def _other_boards(across: int, down: int, highest: int) -> list[tuple[int, int]]:
     """Boards that have a marker of number ``highest`` and few beyond it: the one with swapped sizes first."""
-    sides = range(3, _MOST_SQUARES + 1)
-    fitting = [(a, d) for a in sides for d in sides if highest < a * d // 2 <= highest + 3 and (a, d) != (across, down)]
+    sides = range(3, tuned.MOST_SQUARES + 1)
+    fitting = [
+        (a, d)
+        for a in sides
+        for d in sides
+        if highest < a * d // 2 <= highest + tuned.UNSEEN_MARKERS and (a, d) != (across, down)
+    ]
     return list(dict.fromkeys([(down, across), *fitting]))
 
 
@@ -245,7 +253,7 @@ class Chessboard(Target):
         pixels = pixels.reshape(down, across, 2)
         # A third of the distance to the nearest neighbor, so that the window holds no other corner.
         steps = [np.linalg.norm(np.diff(pixels, axis=k), axis=2).min() for k in (0, 1)]
-        window = int(np.clip(min(steps) / 3, 2, 11))
+        window = int(np.clip(min(steps) / 3, tuned.LEAST_WINDOW_PX, tuned.MOST_WINDOW_PX))
         pixels = cv2.cornerSubPix(image, pixels.reshape(-1, 1, 2), (window, window), (-1, -1), _SUBPIX)
         pixels = pixels.reshape(down, across, 2).astype(np.float64)
         # The detector may start at either end: of the two end squares, the one at the first corner is darker.

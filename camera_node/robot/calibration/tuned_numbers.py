@@ -19,9 +19,12 @@ EXPLAIN_EVERY = 50  # of the pictures without the target
 
 # OpenCV pairs every sample with every other: more samples take seconds and gain nothing.
 MAX_CLOSED_FORM = 60
+MAX_SAMPLES = 80  # whose motions are compared; they have 3160 pairs
 # The refinement: Student's t of so many degrees of freedom, rounds, and the relative change of the noise that ends
 # them.
 DEGREES_OF_FREEDOM, ROUNDS, SETTLED = 8.0, 20, 1e-4
+SMALLEST_LIKELIHOOD_GAIN = 1e-10  # relative, which ends a round
+NOISE_STEPS, NOISE_SETTLED = 100, 0.1 * SETTLED  # the same of the steps in which a round's noise is found
 MIN_NOISE = 1e-7  # perfect data would make the likelihood infinite
 
 # Residuals of a hand-eye calibration: medians to warn about, and those of a sample that does not fit the others (less
@@ -31,8 +34,10 @@ NOTABLE_DEG, NOTABLE_MM = 0.5, 1.0
 # A sample's weight is lower if its six whitened residuals have a sum of squares above 32. This happens to one good
 # sample in sixty thousand.
 OUTLIER_WEIGHT = 0.35
+WARNED_OUTLIERS = 5  # that are named
 # Larger values mean wrong input: inverted poses, millimeters, or poses of another body.
 WORST_DEG, WORST_MM, FARTHEST_M = 15.0, 100.0, 5.0
+MOST_QUATERNION_ERROR = 0.01  # of the length of a given quaternion
 
 # The scale of distances to the target is told where it differs from 1 by more than this and by so many standard
 # deviations; a factor beyond the bound is no size of a board. With fewer poses there is nothing left to judge it by.
@@ -43,6 +48,13 @@ MILLIMETERS_M = 20.0  # median distance beyond which poses are in millimeters
 MIN_CORNERS, MIN_MARKERS = 6, 3
 # Ratio of reprojection errors above which the second of the two poses of a flat target is ruled out.
 AMBIGUOUS = 1.5
+# ... of targets with fewer corners alone; and a smaller error than this is chance.
+AMBIGUOUS_CORNERS, AMBIGUOUS_PX = 12, 0.05
+# Steps of a corner's refinement, the motion (px) that ends them, and the least and largest half side of its window.
+SUBPIX_STEPS, SUBPIX_PX = 40, 1e-4
+LEAST_WINDOW_PX, MOST_WINDOW_PX = 2, 11
+MOST_SQUARES = 16  # across and down, of ChArUco boards that are tried
+UNSEEN_MARKERS = 3  # most markers that such a board has beyond the highest that is seen
 EXPLAINED = 4  # pictures without the target that are examined for the reason, which takes a second
 
 # Pictures of a lens calibration that show the target.
@@ -51,6 +63,8 @@ MIN_VIEWS = 4
 MIN_TILT_DEG = 10.0
 # Reprojection error of a picture that is left out, in medians of all.
 OUTLIER_ERROR = 4.0
+LARGEST_FOCAL_STD = 0.2  # of the focal length; with more, the pictures determine none
+COVERED_CELLS = 6  # across and down, by which the covered share of the picture is told
 # Focal lengths over the image's longer side: 136 and 7 degrees of view. The solver diverges beyond them if the images
 # do not determine a lens.
 SHORTEST_FOCAL, LONGEST_FOCAL = 0.2, 8.0
@@ -63,6 +77,7 @@ ROBUST_PX, OUTLIER_PX = 1.0, 1.0
 LARGEST_PX = 5.0
 # Levenberg-Marquardt: share of the diagonal added at first and at most, steps, and the relative gain that ends it.
 FIRST_DAMPING, LAST_DAMPING, MOST_STEPS, SMALLEST_GAIN = 1e-3, 1e12, 100, 1e-9
+DAMPING_FACTOR = 10  # more after a step that gained nothing, less after another
 # Of a video, moments so far apart; the target stands still if its corners move by less between two frames.
 MOMENT_S, STILL_PX = 0.5, 0.5
 # A live moment is new where the target has moved by this share of the image's width.

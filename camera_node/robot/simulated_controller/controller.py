@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.simulated_controller import tuned_numbers as tuned
 from camera_node.robot.simulated_controller.joint_motion import STEP_S, JointMotion
 from freshfield.geometry import Array
 
@@ -23,8 +24,6 @@ log = logging.getLogger("camera-node.arm")
 
 HOME_RAD = (0.0, -np.pi / 2, -np.pi / 2, -np.pi / 2, np.pi / 2, 0.0)
 STEP_NS = round(STEP_S * 1e9)
-_HISTORY_STEPS = 10_000  # 20 s
-_MAX_CATCH_UP_STEPS = 5_000
 
 MOVE_J, SERVO_J, SERVO_STOP, STOP_SCRIPT, NO_COMMAND = 1, 11, 16, 255, 0
 STOP_J, SET_WATCHDOG = 34, 35
@@ -50,20 +49,20 @@ class Controller:
         self._busy = False
         self._watchdog_steps: int | None = None
         self._watchdog_reset_step = 0
-        self._history = np.tile(self.motion.q, (_HISTORY_STEPS, 1))
+        self._history = np.tile(self.motion.q, (tuned.HISTORY_STEPS, 1))
 
     def advance_to(self, now_ns: int, on_step: Callable[[], None] | None = None) -> None:
         """Execute every step that is due at ``now_ns``, and call ``on_step`` after each. Nothing happens
         until a clock that was set back has caught up. After a long pause of the machine the arm continues
         from where it was."""
         due = (now_ns - self._start_ns) // STEP_NS
-        if due - self.steps > _MAX_CATCH_UP_STEPS:
+        if due - self.steps > tuned.MAX_CATCH_UP_STEPS:
             self._start_ns += (due - self.steps) * STEP_NS
             return
         while self.steps < due:
             self.motion.step()
             self.steps += 1
-            self._history[self.steps % _HISTORY_STEPS] = self.motion.q
+            self._history[self.steps % tuned.HISTORY_STEPS] = self.motion.q
             if self._busy and not self.motion.moving:
                 self._finish()
             limit = self._watchdog_steps
@@ -76,10 +75,10 @@ class Controller:
         """True joint angles (6,) at ``t_ns``, interpolated between two steps. Returns their instant too:
         ``t_ns``, or the nearest one that is known (the last step, or 20 s ago)."""
         position = (t_ns - self._start_ns) / STEP_NS
-        position = min(max(position, float(max(0, self.steps - _HISTORY_STEPS + 2))), float(self.steps))
+        position = min(max(position, float(max(0, self.steps - tuned.HISTORY_STEPS + 2))), float(self.steps))
         whole = int(position)
-        a = self._history[whole % _HISTORY_STEPS]
-        b = self._history[min(whole + 1, self.steps) % _HISTORY_STEPS]
+        a = self._history[whole % tuned.HISTORY_STEPS]
+        b = self._history[min(whole + 1, self.steps) % tuned.HISTORY_STEPS]
         part = position - whole
         return round(self._start_ns + position * STEP_NS), (1.0 - part) * a + part * b
 

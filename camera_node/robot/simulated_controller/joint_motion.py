@@ -12,13 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.simulated_controller import tuned_numbers as tuned
 from freshfield.geometry import Array
 
 STEP_S = 0.002
-MAX_ACCELERATION_RAD_S2 = 40.0
-"""Bound of every command. UR's default for moveJ is 1.4."""
-STOP_RAD_S2 = 10.0
-_SERVO_WITHOUT_COMMAND_S = 0.2
 _ARRIVED_RAD = 1e-9
 
 
@@ -52,7 +49,7 @@ class JointMotion:
         fastest = float(np.min(np.minimum(speed_rad_s, self._limits[2]) / np.maximum(share, 1e-12)))
         self._target, self.mode = goal, "move"
         self._speed = fastest * share
-        self._acceleration = min(acceleration_rad_s2, MAX_ACCELERATION_RAD_S2) * share
+        self._acceleration = min(acceleration_rad_s2, tuned.MAX_ACCELERATION_RAD_S2) * share
         return True
 
     def servo(self, target: ArrayLike) -> bool:
@@ -62,19 +59,19 @@ class JointMotion:
         if not self._within_limits(goal):
             return False
         self._target, self.mode, self._elapsed_s = goal, "servo", 0.0
-        self._speed, self._acceleration = self._limits[2], np.full(6, MAX_ACCELERATION_RAD_S2)
+        self._speed, self._acceleration = self._limits[2], np.full(6, tuned.MAX_ACCELERATION_RAD_S2)
         return True
 
-    def stop(self, deceleration_rad_s2: float = STOP_RAD_S2) -> None:
+    def stop(self, deceleration_rad_s2: float = tuned.STOP_RAD_S2) -> None:
         """Come to rest at this deceleration."""
-        rate = deceleration_rad_s2 if deceleration_rad_s2 > 0 else STOP_RAD_S2
-        self._acceleration = np.full(6, min(rate, MAX_ACCELERATION_RAD_S2))
+        rate = deceleration_rad_s2 if deceleration_rad_s2 > 0 else tuned.STOP_RAD_S2
+        self._acceleration = np.full(6, min(rate, tuned.MAX_ACCELERATION_RAD_S2))
         self.mode = "stop" if self.qd.any() else "idle"
 
     def step(self) -> None:
         """Advance by ``STEP_S``."""
         self._elapsed_s += STEP_S
-        if self.mode == "servo" and self._elapsed_s > _SERVO_WITHOUT_COMMAND_S:
+        if self.mode == "servo" and self._elapsed_s > tuned.SERVO_WITHOUT_COMMAND_S:
             self.stop()
         if self.mode == "idle":
             return

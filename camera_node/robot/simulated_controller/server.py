@@ -20,6 +20,7 @@ from collections.abc import Awaitable, Callable
 
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller import rtde_protocol as rtde
+from camera_node.robot.simulated_controller import tuned_numbers as tuned
 from camera_node.robot.simulated_controller.controller import Controller
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from freshfield.clock import Clock
@@ -30,8 +31,6 @@ Handler = Callable[[asyncio.StreamReader, asyncio.StreamWriter], Awaitable[None]
 
 RTDE_PORT, DASHBOARD_PORT, SCRIPT_PORT = 30004, 29999, 30003
 VERSION = (5, 12, 0, 0)
-_MAX_WAITING_BYTES = 1 << 20
-_IDLE_STEPS = 4
 _DASHBOARD = {
     "PolyscopeVersion": "URSoftware 5.12.0.0 (simulated)",
     "get serial number": "20230000001",
@@ -75,8 +74,8 @@ class ControllerServer:
         while True:
             self.controller.advance_to(self.clock.now_ns(), self._publish)
             # Wake up as often as the fastest client needs. Each time, all steps that are due are executed.
-            fastest = min((client.every_steps for client in self.clients), default=_IDLE_STEPS)
-            await asyncio.sleep(STEP_S * min(fastest, _IDLE_STEPS))
+            fastest = min((client.every_steps for client in self.clients), default=tuned.IDLE_STEPS)
+            await asyncio.sleep(STEP_S * min(fastest, tuned.IDLE_STEPS))
 
     def _publish(self) -> None:
         due = [client for client in self.clients if client.due(self.controller.steps)]
@@ -119,7 +118,7 @@ class ControllerServer:
 
     async def _serve_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         # The program is not interpreted: the client library's program only executes register commands.
-        while await reader.read(1 << 16):
+        while await reader.read(tuned.READ_BYTES):
             self.controller.start_program()
 
     async def _serve_truth(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -146,7 +145,7 @@ class _Client:
     def send(self, values: dict) -> None:
         assert self._output is not None
         # A client that does not read loses samples, so that it cannot fill this machine's memory.
-        if self._writer.transport.get_write_buffer_size() < _MAX_WAITING_BYTES:
+        if self._writer.transport.get_write_buffer_size() < tuned.MAX_WAITING_BYTES:
             self._reply(rtde.DATA, self._output.pack(values))
 
     def handle(self, kind: int, payload: bytes) -> dict | None:

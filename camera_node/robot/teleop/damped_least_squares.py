@@ -5,19 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from camera_node.robot.arm.kinematics import ArmModel, pose_difference
+from camera_node.robot.teleop import tuned_numbers as tuned
 from camera_node.robot.teleop.settings import TeleopConfig
 from freshfield.geometry import Array
-
-# Damping distorts the flange's direction, so it is applied only near a singularity, where the Jacobian's least
-# singular value falls below _DAMPING_THRESHOLD (Maciejewski and Klein 1988).
-_DAMPING, _DAMPING_THRESHOLD = 0.05, 0.08
 
 
 def joint_speeds(arm: ArmModel, config: TeleopConfig, q: Array, target: Array) -> Array:
     """Joint speeds (6,), rad/s, from joints ``q`` (6,) towards ``target``, base-from-flange (4, 4):
     ``v = J^T (J J^T + damping^2)^-1 twist`` (Wampler 1986), scaled down to the joints' speed limit."""
     left, values, right = np.linalg.svd(arm.jacobian(q))
-    damping = _DAMPING * max(0.0, 1.0 - (float(values[-1]) / _DAMPING_THRESHOLD) ** 2)
+    damping = tuned.DAMPING * max(0.0, 1.0 - (float(values[-1]) / tuned.DAMPING_THRESHOLD) ** 2)
     wanted = commanded_twist(arm, config, q, target)
     found: Array = right.T @ (values / (values**2 + damping**2) * (left.T @ wanted))
     fastest = float(np.abs(found).max())

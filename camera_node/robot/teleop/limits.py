@@ -15,12 +15,12 @@ from numpy.typing import ArrayLike
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.teleop import tuned_numbers as tuned
 from camera_node.robot.teleop.settings import TeleopConfig
 from freshfield.geometry import Array
 
 # Limits are this much tighter than configured, because sums over a stop round differently at each tick.
 _ROUNDING = 1e-9
-_STEP_FRACTIONS = (1.0, 0.5, 0.2)
 
 
 class JointRates:
@@ -97,7 +97,7 @@ class Limiter:
         limits = self.rates
         asked, stopping = limits.clamp(self.q, self.v, speeds), limits.stopping(self.v)
         chosen = stopping
-        for k, share in enumerate(_STEP_FRACTIONS):
+        for k, share in enumerate(tuned.STEP_FRACTIONS):
             tried = stopping + share * (asked - stopping)
             violated = self._violated_limit(self.q + tried * self.dt_s, tried)
             if violated is None:

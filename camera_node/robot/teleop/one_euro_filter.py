@@ -6,10 +6,8 @@ import math
 
 import numpy as np
 
+from camera_node.robot.teleop import tuned_numbers as tuned
 from freshfield.geometry import Array, quaternion_multiply, quaternion_to_matrix, slerp, so3_log
-
-_SPEED_HZ = 2.0  # cutoff of the filter of the speed itself
-_MIN_S, _MAX_S = 1e-4, 0.5  # bounds of the time between two samples: others come from a faulty clock
 
 
 class OneEuro:
@@ -33,12 +31,12 @@ class OneEuro:
         if self._position is None:
             self._position, self._quaternion, self._speeds = position.copy(), quaternion.copy(), np.zeros(2)
             return self._position, self._quaternion
-        dt = min(max(dt_s, _MIN_S), _MAX_S)
+        dt = min(max(dt_s, tuned.LEAST_STEP_S), tuned.MOST_STEP_S)
         step = position - self._position
         inverse = self._quaternion * np.array([1.0, -1.0, -1.0, -1.0])
         turn = so3_log(quaternion_to_matrix(quaternion_multiply(quaternion, inverse)))
         now = np.array([np.linalg.norm(step), np.linalg.norm(turn)]) / dt
-        self._speeds = self._speeds + _smoothing_factor(_SPEED_HZ, dt) * (now - self._speeds)
+        self._speeds = self._speeds + _smoothing_factor(tuned.SPEED_HZ, dt) * (now - self._speeds)
         shares = [_smoothing_factor(self._hz + self._slope * speed, dt) for speed in self._speeds]
         self._position = self._position + shares[0] * step
         self._quaternion = slerp(self._quaternion, quaternion, shares[1])

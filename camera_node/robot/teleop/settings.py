@@ -6,17 +6,6 @@ from typing import Annotated
 
 from freshfield.settings import Settings, about, within
 
-STEP_M, STEP_RAD = 0.005, 0.02  # of a key
-FARTHEST_M = 10.0  # positions of a stylus farther from its origin are invalid
-MAX_MESSAGES = 64  # of a network stylus at a tick, so that a flood does not delay the arm
-OWNED_NS = 1_000_000_000  # silence after which another sender counts
-# servoJ's own filter: lookahead time and gain (UR's script manual: 0.03 to 0.2 s, 100 to 2000). The gain is
-# the lowest that still follows well, because the targets are smooth already.
-LOOKAHEAD_S, SERVO_GAIN = 0.1, 300.0
-MAX_LAG_RAD = 0.35  # an arm that is farther behind its target is held by something, or has stopped
-SHOW_S = 0.5  # between two lines for the operator
-LONGEST_STOP_S = 3.0  # within the limits below no stop takes longer
-
 Vector3 = tuple[float, float, float]
 
 

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 
 from camera_node.robot.arm import ArmError
-from camera_node.robot.teleop.settings import FARTHEST_M, MAX_MESSAGES, OWNED_NS, STEP_M, STEP_RAD
+from camera_node.robot.teleop import tuned_numbers as tuned
 from freshfield.geometry import Array, matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
 
 log = logging.getLogger("camera-node.teleop")
@@ -65,7 +65,11 @@ class StylusSample(msgspec.Struct, frozen=True, rename={"position_m": "p", "quat
         if len(values) != 7 or not all(map(math.isfinite, values)):
             return False
         norm = math.sqrt(sum(v * v for v in self.quaternion))
-        return max(map(abs, self.position_m)) <= FARTHEST_M and 0.5 < norm < 2.0 and 0 <= self.t_ns < 2**63
+        return (
+            max(map(abs, self.position_m)) <= tuned.FARTHEST_M
+            and tuned.LEAST_NORM < norm < tuned.MOST_NORM
+            and 0 <= self.t_ns < 2**63
+        )
 
     def arrays(self) -> tuple[Array, Array]:
         """Position (3,) and unit quaternion (4,) of a valid sample."""
@@ -116,8 +120,8 @@ class KeyboardStylus:
                 self._clutch = not self._clutch
             elif key in _MOVES:
                 axis, sign = _MOVES[key]
-                step[axis] += sign * (STEP_M if axis < 3 else STEP_RAD)
-        half = 0.5 * FARTHEST_M  # with the clutch open it may move without end
+                step[axis] += sign * (tuned.STEP_M if axis < 3 else tuned.STEP_RAD)
+        half = 0.5 * tuned.FARTHEST_M  # with the clutch open it may move without end
         self._position = np.clip(self._position + step[:3], -half, half)
         turned = matrix_to_quaternion(so3_exp(step[3:]))
         self._quaternion = quaternion_normalize(quaternion_multiply(turned, self._quaternion))
@@ -174,12 +178,12 @@ class NetworkStylus:
     def poll(self, now_ns: int) -> list[StylusSample]:
         """See ``Stylus``."""
         found = []
-        for _ in range(MAX_MESSAGES):
+        for _ in range(tuned.MAX_MESSAGES):
             try:
                 data, sender = self._socket.recvfrom(MAX_BYTES + 1)
             except OSError:
                 break  # nothing there
-            if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < OWNED_NS:
+            if self._owner is not None and sender[:2] != self._owner and now_ns - self._heard_ns < tuned.OWNED_NS:
                 continue
             sample = parse(data)
             if sample is None:

@@ -17,7 +17,8 @@ from camera_node.robot.arm.control import confirm_motion, open_stream, stop_even
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller.controller import HOME_RAD
-from camera_node.robot.teleop.settings import LONGEST_STOP_S, SHOW_S, TeleopConfig
+from camera_node.robot.teleop import tuned_numbers as tuned
+from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus, open_stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
@@ -87,7 +88,7 @@ def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float
             now_s = time.monotonic()
             if seconds is not None and now_s - started_s >= seconds:
                 break
-            if now_s - shown_s >= SHOW_S and sys.stderr.isatty():
+            if now_s - shown_s >= tuned.SHOW_S and sys.stderr.isatty():
                 shown_s = now_s
                 print(f"\r{_status_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
             next_s += period_s
@@ -108,7 +109,7 @@ def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float
 
 
 def _come_to_rest(operator: Teleoperator, sink: Sink, period_s: float) -> None:
-    for _ in range(round(LONGEST_STOP_S / period_s)):
+    for _ in range(round(tuned.LONGEST_STOP_S / period_s)):
         begun_s = time.monotonic()
         command, at_rest = operator.stop()
         sink.send(operator.ticks * period_s, command)

@@ -9,15 +9,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.datasets.records import DatasetError, Image
 from freshfield import payload  # sets OpenCV's size limit before cv2 is imported
 from freshfield.geometry import Pinhole
 from freshfield.untrusted import check_file, read_bytes
 
 import cv2  # isort: skip
-
-
-_HEADER_BYTES = 2**18  # holds the size of nearly every JPEG, behind its EXIF data and thumbnail
 
 
 def decode_file(path: Path, flags: int) -> NDArray[Any] | None:
@@ -45,7 +43,7 @@ def image_size(path: Path) -> tuple[int, int]:
     """Width and height of an image file as stored; of JPEG and PNG from the header. Raises DatasetError."""
     check_file(path)
     with path.open("rb") as file:
-        head = file.read(_HEADER_BYTES)
+        head = file.read(tuned.HEADER_BYTES)
     if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) >= 24:
         width, height = struct.unpack(">II", head[16:24])
         return width, height

@@ -15,6 +15,7 @@ from typing import TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.datasets.records import DatasetError
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.geometry import Array, Pinhole, invertible
@@ -23,11 +24,6 @@ import cv2  # isort: skip
 
 Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.uint16])
 
-# Widest angle from the axis of an undistorted image; beyond it the corners are mostly stretched.
-_WIDEST_RAD = math.radians(60.0)
-# Focal lengths to try, as multiples of the lens's own, narrowest view first.
-_ZOOMS = 4.0 * 0.98 ** np.arange(180)
-_BORDER = 65
 # Largest side of the image that a lens is described for; smaller copies of it may be read.
 _MAX_SIDE_PX = 10**6
 
@@ -121,7 +117,7 @@ def _as_pinhole(lens: Lens) -> Pinhole | None:
 @lru_cache(maxsize=256)
 def _undistorted(lens: Lens) -> Pinhole:
     found: Pinhole | None = None
-    for zoom in _ZOOMS:
+    for zoom in tuned.ZOOM_FROM * tuned.ZOOM_STEP ** np.arange(tuned.ZOOM_STEPS):
         tried = Pinhole(lens.width, lens.height, zoom * lens.fx, zoom * lens.fy, lens.cx, lens.cy)
         if not _covered(lens, tried):
             break
@@ -133,15 +129,16 @@ def _undistorted(lens: Lens) -> Pinhole:
 
 def _covered(lens: Lens, straight: Pinhole) -> bool:
     """Whether every pixel of ``straight`` lies within the lens's image, and none of that is shown twice."""
-    side = np.linspace(0.0, 1.0, _BORDER)
-    u = np.concatenate([side, side, np.zeros(_BORDER), np.ones(_BORDER)]) * straight.width
-    v = np.concatenate([np.zeros(_BORDER), np.ones(_BORDER), side, side]) * straight.height
+    count = tuned.BORDER_POINTS
+    side = np.linspace(0.0, 1.0, count)
+    u = np.concatenate([side, side, np.zeros(count), np.ones(count)]) * straight.width
+    v = np.concatenate([np.zeros(count), np.ones(count), side, side]) * straight.height
     x, y = (u - straight.cx) / straight.fx, (v - straight.cy) / straight.fy
     furthest = float(np.hypot(x, y).max())
-    if furthest > math.tan(_WIDEST_RAD):
+    if furthest > math.tan(math.radians(tuned.WIDEST_DEG)):
         return False
-    along = np.linspace(0.0, furthest, _BORDER)
-    if np.any(np.diff(replace(lens, tangential=(0.0, 0.0))._distort(along, np.zeros(_BORDER))[0]) <= 0):
+    along = np.linspace(0.0, furthest, count)
+    if np.any(np.diff(replace(lens, tangential=(0.0, 0.0))._distort(along, np.zeros(count))[0]) <= 0):
         return False
     at = lens.project(np.stack([x, y, np.ones_like(x)], axis=-1))
     return bool(np.all((at >= 0.0) & (at <= (lens.width, lens.height))))

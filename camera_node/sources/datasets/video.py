@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.base import rate
 from camera_node.sources.datasets.imaging import as_image, resize, shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
@@ -29,13 +30,6 @@ import cv2  # isort: skip
 
 FILES = ("calib*.json", "rig*.json")  # a folder's rig*.json counts where it has no calib*.json
 _PLACES = ("videos/{}.mp4", "{}.mp4")
-# Up to this distance, decoding forward is cheaper than seeking, which decodes from a key frame.
-_SKIP_FRAMES = 30
-# Videos decode only forwards: to play backwards, this many (shrunk) frames are decoded at once.
-_BLOCK = 12
-# So many of the last frames tell whether a video ends where its packets do; more, where stamps are so uneven that
-# OpenCV, which seeks by the mean rate, finds none.
-_ENDINGS = (4, _SKIP_FRAMES)
 
 
 def load_dataset(
@@ -133,8 +127,8 @@ def _find_calibration(folder: Path) -> Path:
 class Clip:
     """Frames 0 to count - 1 of a video file, which is decoded forwards. Its decoder opens with the first frame.
 
-    Attributes: count; times_s, each frame's own stamp; fps, the usual rate (30 if the file does not tell); even,
-    whether the stamps keep to it; width and height of the frames.
+    Attributes: count; times_s, each frame's own stamp; fps, the usual rate (``VIDEO_FPS`` if the file does not tell);
+    even, whether the stamps keep to it; width and height of the frames.
     rotated: as the file's rotation tag says; otherwise as stored.
     Raises DatasetError if the file cannot be opened, or has no frames.
     """
@@ -143,7 +137,7 @@ class Clip:
         self.path = path
         self._rotated = rotated
         capture = self._open()
-        self.fps = float(capture.get(cv2.CAP_PROP_FPS)) or 30.0
+        self.fps = float(capture.get(cv2.CAP_PROP_FPS)) or tuned.VIDEO_FPS
         self.width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         self.height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         self._tag = int(capture.get(cv2.CAP_PROP_ORIENTATION_META))
@@ -157,12 +151,12 @@ class Clip:
         if self.count < 1:
             raise DatasetError(f"{path}: the video says it has no frames")
         nominal_ms = np.arange(self.count) * (1e3 / self.fps)
-        self.even = float(np.abs(self._from_first_ms - nominal_ms).max()) < 100.0 / self.fps
+        self.even = float(np.abs(self._from_first_ms - nominal_ms).max()) < tuned.EVEN_PERIODS * 1e3 / self.fps
         if not self.even:
             # The mean without gaps: the median of stamps in whole milliseconds is off by up to half of one.
             apart_ms = np.diff(self._from_first_ms)
             usual_ms = np.median(apart_ms)
-            self.fps = 1e3 / float(apart_ms[np.abs(apart_ms - usual_ms) <= 0.5 * usual_ms].mean())
+            self.fps = 1e3 / float(apart_ms[np.abs(apart_ms - usual_ms) <= tuned.SAME_PERIOD * usual_ms].mean())
         self.times_s = first_s + self._from_first_ms / 1e3
         self._capture: cv2.VideoCapture | None = None
         self._next, self._last = 0, -1
@@ -177,10 +171,10 @@ class Clip:
         no such frame, or it cannot be decoded."""
         if not 0 <= index < self.count:
             raise DatasetError(f"{self.path}: frame {index} is not within 0..{self.count - 1}")
-        backwards, self._last = 0 < self._last - index <= _BLOCK, index
+        backwards, self._last = 0 < self._last - index <= tuned.BLOCK_FRAMES, index
         found = self._block.get(index)
         if found is None or found.shape[:2] != (height, width):
-            first = max(0, index - _BLOCK + 1) if backwards else index
+            first = max(0, index - tuned.BLOCK_FRAMES + 1) if backwards else index
             self._block = {k: self._decode(k, width, height) for k in range(first, index + 1)}
         return self._block[index]
 
@@ -194,9 +188,9 @@ class Clip:
     def _decode(self, index: int, width: int, height: int) -> Image:
         if self._capture is None:
             self._capture = self._open()
-        if not self._next <= index <= self._next + _SKIP_FRAMES:
+        if not self._next <= index <= self._next + tuned.SKIP_FRAMES:
             # OpenCV seeks by the mean rate: where that led, the stamp of the next frame tells.
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, index - (1 if self.even else _SKIP_FRAMES)))
+            self._capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, index - (1 if self.even else tuned.SKIP_FRAMES)))
             found = self._capture.grab()
             stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
             self._next = int(np.abs(self._from_first_ms - stamp_ms).argmin()) + 1
@@ -228,7 +222,7 @@ def _stamps(path: Path, fps: float) -> tuple[NDArray[np.float64], float]:
     stamps = sorted(_grabbed(cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])))
     if len(stamps) > 1:
         late_ms = 0.5 * (stamps[-1][0] + stamps[-2][0])
-        if not any(_last_ms(path, max(0, len(stamps) - back)) > late_ms for back in _ENDINGS):
+        if not any(_last_ms(path, max(0, len(stamps) - back)) > late_ms for back in tuned.ENDING_FRAMES):
             stamps = sorted(_grabbed(cv2.VideoCapture(str(path)))) or stamps
     return np.array([ms for ms, _ in stamps]), stamps[0][1] / fps if stamps else 0.0
 

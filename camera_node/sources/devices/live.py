@@ -18,10 +18,10 @@ from functools import partial
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
 from camera_node.settings import LiveConfig, beside
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
-from camera_node.sources.tuned_numbers import LIVE_FPS, REOPEN_AFTER_S
 from freshfield.clock import Clock, WallClock
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
@@ -29,8 +29,6 @@ from freshfield.scenario import Scenario, ScenarioError
 
 log = logging.getLogger("camera-node")
 
-_GRAB_S = 0.5
-_JOIN_S = 2.0
 # kind -> its driver's module here and class
 _DRIVERS = {"camera": ("opencv", "OpenCvFeed"), "oak": ("oak", "OakFeed"), "realsense": ("realsense", "RealsenseFeed")}
 
@@ -71,12 +69,12 @@ class LiveSource(Source):
         opener: Callable[[], Feed],
         poses: PoseProvider,
         calibrated: Pinhole | float | None = None,
-        first_frame_s: float = 3.0,
+        first_frame_s: float = tuned.FIRST_FRAME_S,
     ) -> None:
         self.camera, self.fps = camera, fps
         self._open, self._poses = opener, poses
         self._patience_s = first_frame_s
-        self._wait_s = min(0.5, 0.5 / float(fps))
+        self._wait_s = min(tuned.NEXT_FRAME_S, tuned.NEXT_FRAME_PERIODS / float(fps))
         self._condition = threading.Condition()
         self._newest: tuple[int, Image, DepthImage | None] | None = None
         self._trouble = "none since the last one"
@@ -126,7 +124,7 @@ class LiveSource(Source):
         atexit.unregister(self.close)
         self._stop.set()
         if self._thread.is_alive():
-            self._thread.join(_JOIN_S)
+            self._thread.join(tuned.CAMERA_JOIN_S)
 
     def _scaled(self, lens: Pinhole, image: Image) -> Pinhole:
         height, width = image.shape[:2]
@@ -156,15 +154,15 @@ class LiveSource(Source):
                 self._trouble = str(trouble)
                 _close_quietly(current)
                 current = None
-                self._stop.wait(REOPEN_AFTER_S[min(failures, len(REOPEN_AFTER_S) - 1)])
+                self._stop.wait(tuned.REOPEN_AFTER_S[min(failures, len(tuned.REOPEN_AFTER_S) - 1)])
                 failures += 1
         _close_quietly(current)
 
     def _take(self, feed: Feed) -> bool:
-        """Wait up to _GRAB_S for a frame and keep it. Returns whether one came."""
-        taken = feed.grab(_GRAB_S)
+        """Wait up to ``GRAB_S`` for a frame and keep it. Returns whether one came."""
+        taken = feed.grab(tuned.GRAB_S)
         if taken is None:
-            self._trouble = f"none for {_GRAB_S:g} s"
+            self._trouble = f"none for {tuned.GRAB_S:g} s"
             return False
         if taken[1].shape[:2] != (self.intrinsics.height, self.intrinsics.width):
             raise CameraError(f"{self.camera}: its pictures have changed their size")
@@ -186,7 +184,7 @@ def open_live(
         for camera in cameras:
             if camera not in config.devices:
                 raise ScenarioError(f"{scenario.path}: source.devices.{camera}: missing: which camera is it?")
-    fps, clock = rate(config.fps or LIVE_FPS), WallClock()
+    fps, clock = rate(config.fps or tuned.LIVE_FPS), WallClock()
     known = calibrations(scenario, config) if any_fov_deg is None else {}
     standing = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     poses = _poses(scenario, config, cameras, known) if any_fov_deg is None else dict.fromkeys(cameras, standing)

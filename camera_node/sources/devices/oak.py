@@ -15,12 +15,12 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.settings import OakConfig
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.devices.feed import CameraError, Feed, Image, Plugged, intrinsics_or_reason, select_device
 from freshfield.clock import Clock
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole
 
-_SEARCH_MS = "2000"
 _ADVICE = (
     "is it plugged in (USB 3, its own supply), and may this user open it (udev rule for vendor 03e7, see deploy/lab)?"
 )
@@ -31,7 +31,7 @@ METERS_PER_COUNT = 0.001  # depthai's depth is in millimeters unless told otherw
 
 def library() -> Any:
     """The module depthai. Raises CameraError saying what to install."""
-    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", _SEARCH_MS)  # the default is 11.5 s
+    os.environ.setdefault("DEPTHAI_SEARCH_TIMEOUT", str(tuned.OAK_SEARCH_MS))
     os.environ.setdefault("DEPTHAI_LEVEL", "error")
     # Its signal handlers would end the node when a file reaches its size limit (SIGXFSZ).
     os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")

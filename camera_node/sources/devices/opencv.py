@@ -18,15 +18,12 @@ import cv2
 import numpy as np
 
 from camera_node.settings import CameraConfig
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.devices.feed import CameraError, Feed, Image
 from freshfield.clock import Clock
 
 log = logging.getLogger("camera-node")
 
-_OPEN_MS = 2500
-_READ_MS = 2000
-# A stamp on the machine's monotonic clock is younger than this; otherwise it is from another clock.
-_PLAUSIBLE_NS = 1_000_000_000
 _BY_KERNEL, _BY_ARRIVAL = "the kernel", "their arrival, less latency_ms"
 _MANUAL = 1  # V4L2's value for manual exposure
 
@@ -74,7 +71,7 @@ class OpenCvFeed(Feed):
         stamp_age_ns = None
         if self._v4l2 and self.stamped_by != _BY_ARRIVAL:
             stamp_age_ns = time.monotonic_ns() - round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            if not 0 <= stamp_age_ns < _PLAUSIBLE_NS:
+            if not 0 <= stamp_age_ns < tuned.PLAUSIBLE_NS:
                 stamp_age_ns = None
         if not self.stamped_by:
             self.stamped_by = _BY_ARRIVAL if stamp_age_ns is None else _BY_KERNEL
@@ -89,7 +86,7 @@ class OpenCvFeed(Feed):
 
 def _open(camera: str, device: str) -> cv2.VideoCapture:
     if "://" in device:
-        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, _OPEN_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, _READ_MS]
+        limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, tuned.OPEN_MS, cv2.CAP_PROP_READ_TIMEOUT_MSEC, tuned.READ_MS]
         capture = cv2.VideoCapture(device, cv2.CAP_FFMPEG, limits)
         advice = "is the address right, and does the camera answer there?"
     else:

@@ -19,6 +19,7 @@ import numpy as np
 
 from camera_node.clocks import ArrivalClock
 from camera_node.settings import RealsenseConfig
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.devices.feed import (
     CameraError,
     Feed,
@@ -35,7 +36,6 @@ from freshfield.geometry import Pinhole, Pose, se3
 log = logging.getLogger("camera-node")
 
 _ADVICE = "is it plugged in (USB 3), and may this user open it (udev rules of librealsense, see deploy/lab)?"
-_LONGEST_EXPOSURE_US = 200_000  # the color sensors of the series expose at most 165 ms
 
 
 def library() -> Any:
@@ -183,7 +183,7 @@ def _since_exposed_ns(frame: Any) -> int:
     if not all(frame.supports_frame_metadata(key) for key in keys):
         return 0
     readout_us, exposed_us = (frame.get_frame_metadata(key) for key in keys)
-    return max(0, min(readout_us - exposed_us, _LONGEST_EXPOSURE_US)) * 1000
+    return max(0, min(readout_us - exposed_us, tuned.LONGEST_EXPOSURE_US)) * 1000
 
 
 def lens(camera: str, intrinsics: Any) -> Pinhole:

@@ -19,7 +19,8 @@ import cv2
 
 from edge_server.experiments.engine.content_key import plain, result_key, surroundings
 from edge_server.experiments.engine.tuned_numbers import BATCH, PARENT_EVERY_S, RETRIES
-from edge_server.fields.common.threads.thread_pool import MOST_USEFUL, THREADS_VARIABLE
+from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
+from edge_server.fields.common.tuned_numbers import MOST_WORKERS
 from edge_server.progress import ProgressLine
 from freshfield.files import Lines
 from freshfield.machine_load import usable_cores
@@ -239,7 +240,7 @@ def _compute_on_ray(
 
 
 def limit_threads(threads: int) -> None:
-    """Set the number of threads of OpenCV, of torch and, up to ``MOST_USEFUL``, of our kernels in this process. The
+    """Set the number of threads of OpenCV, of torch and, up to ``MOST_WORKERS``, of our kernels in this process. The
     number of threads that share a convolution of torch changes its last bits."""
     import torch
 
@@ -248,7 +249,7 @@ def limit_threads(threads: int) -> None:
 
 
 def _share_cores(threads: int) -> None:
-    os.environ[THREADS_VARIABLE] = str(min(threads, MOST_USEFUL))
+    os.environ[THREADS_VARIABLE] = str(min(threads, MOST_WORKERS))
     cv2.setNumThreads(threads)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic import SCENES, make_scene
 from camera_node.synthetic.scene import HELD_OUT, Scene
-from camera_node.synthetic.settings import WORLD_FPS
+from camera_node.synthetic.tuned_numbers import WORLD_FPS
 from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.scenes.captures import SUFFIXES, load_captures

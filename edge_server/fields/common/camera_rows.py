@@ -8,18 +8,18 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.kernels.camera import CAMERA, LENS, LIMITS, NEAR, ORIGIN, SIZE
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row
 from freshfield.geometry import Pinhole
 
-MIN_NEAR = 0.01  # scene units
 _BORDER = 17  # points on each edge of an image
 
 
 @lru_cache(maxsize=1024)
 def _limits(camera: Pinhole) -> tuple[float, float, float, float]:
-    """1.3 times the field of view: lowest and highest x / z, then y / z, of rays through the image's edge."""
+    """LENS_FIELD times the field of view: lowest and highest x / z, then y / z, of rays through the image's edge."""
     u, v = np.linspace(0.0, camera.width, _BORDER), np.linspace(0.0, camera.height, _BORDER)
     edge = np.concatenate(
         [np.stack(np.broadcast_arrays(u, y), axis=-1) for y in (0.0, float(camera.height))]
@@ -28,7 +28,7 @@ def _limits(camera: Pinhole) -> tuple[float, float, float, float]:
     rays = camera.rays(edge)
     ratios = rays[:, :2] / np.maximum(rays[:, 2:], 1e-3)
     low, high = ratios.min(axis=0), ratios.max(axis=0)
-    middle, half = 0.5 * (low + high), 0.65 * (high - low)
+    middle, half = 0.5 * (low + high), 0.5 * tuned.LENS_FIELD * (high - low)
     (x0, y0), (x1, y1) = middle - half, middle + half
     return float(x0), float(x1), float(y0), float(y1)
 
@@ -51,6 +51,6 @@ def camera_rows(poses: Sequence[NDArray[np.float64]], lenses: Sequence[Pinhole],
         row[ORIGIN:LENS] = box.normalise(pose[:3, 3])
         row[LENS:LIMITS] = lens_row(lens)
         row[LIMITS:NEAR] = _limits(lens)
-        row[NEAR] = max(MIN_NEAR, box.near_m / box.radius_m)
+        row[NEAR] = max(tuned.MIN_NEAR, box.near_m / box.radius_m)
         row[SIZE], row[SIZE + 1] = lens.width, lens.height
     return rows

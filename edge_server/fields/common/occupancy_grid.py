@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.occupancy import CELLS_A_TASK, Cells, sample_density, threshold
@@ -16,11 +17,6 @@ from edge_server.fields.common.kernels.visual_hull import count_points
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.view_store import ViewStore
-
-EVERY = 8  # steps between refreshes
-PHASES = 4  # refreshes until every cell has been sampled
-FADE = 0.75  # share of a cell's density that is left at each sample
-EMPTY = 0.5  # density per scene unit that counts as empty: a step of it dims by a hundredth or two
 
 
 def cell_centers(cells: int, contracted: bool) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -45,7 +41,7 @@ class OccupancyGrid:
         """A grid that knows nothing yet of the scene in ``box``: the first sample of a cell decides."""
         self.cells, self.min_views = cells, min_views
         self.contracted, self.near = (box.contracted, box.near_m / box.radius_m) if box else (False, 0.1)
-        self.density = np.full(cells**3, EMPTY, np.float32)
+        self.density = np.full(cells**3, tuned.EMPTY_DENSITY, np.float32)
         self.seen = np.zeros(cells**3, np.uint16)
         self.occupied = np.zeros(cells**3, np.uint8)
         self.coarse = np.zeros((cells // COARSE) ** 3, np.uint8)
@@ -79,21 +75,22 @@ class OccupancyGrid:
         self.seen[:] = seen
         self.needed = min(self.min_views, len(store.memory))
         moving = (marked >= max(self.needed, 1)) & (2 * marked >= seen)
-        np.maximum(self.density, np.float32(1.5 * EMPTY), out=self.density, where=moving)
+        np.maximum(self.density, np.float32(tuned.MOVING_DENSITY * tuned.EMPTY_DENSITY), out=self.density, where=moving)
         self.update_occupied()
 
     def refresh(self, pool: Pool, key: np.uint64, phase: int, model: tuple[Any, int, Net], acts: Any, x: Any) -> None:
-        """Sample the density of every ``PHASES``-th cell, from cell ``phase`` on. model: encoding, levels and network.
-        acts, x: see ``sample_density``."""
-        pool.run(sample_density, key, phase % PHASES, PHASES, np.float32(FADE), *model, self._cells(), acts, x)
+        """Sample the density of every ``OCCUPANCY_PHASES``-th cell, from cell ``phase`` on. model: encoding, levels and
+        network. acts, x: see ``sample_density``."""
+        phases, fade = tuned.OCCUPANCY_PHASES, np.float32(tuned.OCCUPANCY_FADE)
+        pool.run(sample_density, key, phase % phases, phases, fade, *model, self._cells(), acts, x)
         self.update_occupied()
 
     def _cells(self) -> Cells:
         return Cells(self.cells, self.seen, self.needed, self._stretch, self.density)
 
     def update_occupied(self) -> None:
-        """Give samples to the cells with a density of ``EMPTY`` or more."""
-        threshold(self._cells(), EMPTY, self.occupied, self.coarse)
+        """Give samples to the cells with a density of ``EMPTY_DENSITY`` or more."""
+        threshold(self._cells(), tuned.EMPTY_DENSITY, self.occupied, self.coarse)
 
 
 assert CELLS_A_TASK <= CHUNK, "a task's samples must fit the scratch of a training chunk"

@@ -10,20 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.kernels.plane_sweep import MOST_VIEWS, NOT_SEEN, SEES, UNMARKED, score_cells, sweep_rays
+from edge_server.fields.common.kernels.plane_sweep import NOT_SEEN, SEES, UNMARKED, score_cells, sweep_rays
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background
 from edge_server.fields.common.settings import FieldSettings
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
 from edge_server.fields.common.threads.thread_pool import Pool
-
-TOLERANCE = 0.08  # between colors, summed over channels: with more, walls are found where there are none
-GUIDE_CELLS = 96  # a side: finer cells hardly guide better, and cost their cube
-GUIDE_RAYS = 1 << 16  # swept at most; the pixels between two rays share their depth
-AGREED = 0.3  # least score of ``score_cells``: half of the cameras that see a cell, and at least three
-LEAST_VIEWS = 3  # fewest views that must see a cell: two agree on a color too often
-_PLAIN, _CLEAR = 0.06, 16  # distance of a color, summed over channels, and alpha below which a pixel is empty
 
 
 def empty_color(settings: FieldSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
@@ -35,10 +29,10 @@ def empty_color(settings: FieldSettings, views: Sequence[View]) -> NDArray[np.fl
 def foreground_mask(image: NDArray[np.uint8], plain: NDArray[np.float32] | None) -> NDArray[np.bool_]:
     """Which pixels, bool (H, W), are neither transparent nor of the plain background color (3,)."""
     if image.shape[2] == 4:
-        return np.asarray(image[..., 3] >= _CLEAR)
+        return np.asarray(image[..., 3] >= tuned.EMPTY_ALPHA)
     if plain is None:
         return np.ones(image.shape[:2], bool)
-    return np.asarray(np.abs(image / 255.0 - plain).sum(axis=2) >= _PLAIN)
+    return np.asarray(np.abs(image / 255.0 - plain).sum(axis=2) >= tuned.EMPTY_COLOR)
 
 
 def score_grid(
@@ -58,7 +52,7 @@ def score_grid(
     least: number of cameras that must see a cell, if ``min_views`` does not ask for more.
     """
     candidates = supervising_views(all_data)
-    chosen = [candidates[k] for k in np.unique(np.linspace(0, len(candidates) - 1, MOST_VIEWS).astype(int))]
+    chosen = [candidates[k] for k in np.unique(np.linspace(0, len(candidates) - 1, tuned.SWEEP_VIEWS).astype(int))]
     some = [views[k] for k in chosen]
     cams = camera_rows([v.camera_to_world for v in some], [v.intrinsics for v in some], box)
     data = pack_cameras(some, box)
@@ -86,7 +80,7 @@ def score_grid(
     plain = empty_color(settings, some)
     plain = np.zeros(0, np.float32) if plain is None else plain
     needed = min(max(settings.min_views, least), len(some))
-    scores, tolerance = np.zeros(cells**3, np.float32), np.float32(TOLERANCE)
+    scores, tolerance = np.zeros(cells**3, np.float32), np.float32(tuned.SWEEP_TOLERANCE)
     pool.run(score_cells, cams, data, blurred, flags, plain, tolerance, box.contracted, cells, needed, scores)
     return scores
 
@@ -107,7 +101,7 @@ def sweep_depths(
     scores: float32 (cells^3,), from ``score_grid``.
     """
     distance = np.zeros(pixels.size, np.float32)
-    near, middle = np.float32(max(0.01, box.near_m / box.radius_m)), np.float32(box.distance_m / box.radius_m)
+    near, middle = np.float32(max(tuned.MIN_NEAR, box.near_m / box.radius_m)), np.float32(box.distance_m / box.radius_m)
     pool.run(
         sweep_rays, data, view_of, pixels, near, middle, box.contracted, cells, np.float32(least), scores, distance
     )
@@ -119,17 +113,16 @@ def depth_guide(
 ) -> NDArray[np.float32]:
     """The probable distance in scene units of what each pixel of ``data`` shows: float32 (N,), 0: unknown;
     (0,) if too few views supervise."""
-    if len(supervising_views(data)) < LEAST_VIEWS:
+    if len(supervising_views(data)) < tuned.GUIDE_VIEWS:
         return np.zeros(0, np.float32)
-    scores = score_grid(settings, pool, box, views, None, data, GUIDE_CELLS, LEAST_VIEWS)
+    scores = score_grid(settings, pool, box, views, None, data, tuned.GUIDE_CELLS, tuned.GUIDE_VIEWS)
     plain = empty_color(settings, [views[k] for k in supervising_views(data)])
     # One pixel of each square is swept for all of it.
-    side = max(int(np.ceil(np.sqrt(data.first[-1] / GUIDE_RAYS))), 1)
+    side = max(int(np.ceil(np.sqrt(data.first[-1] / tuned.GUIDE_RAYS))), 1)
     middles = [_square_centers(v.image.shape[0], v.image.shape[1], side) for v in views]
     of = np.repeat(np.arange(len(views)), [m.size for m in middles])
-    found = sweep_depths(
-        pool, box, data, of, np.concatenate([m.reshape(-1) for m in middles]), scores, GUIDE_CELLS, AGREED
-    )
+    places = np.concatenate([m.reshape(-1) for m in middles])
+    found = sweep_depths(pool, box, data, of, places, scores, tuned.GUIDE_CELLS, tuned.GUIDE_SCORE)
     out = []
     for k, (view, m) in enumerate(zip(views, middles)):
         height, width = view.image.shape[:2]

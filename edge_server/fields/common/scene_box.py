@@ -13,18 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common import tuned_numbers as tuned
 from freshfield.geometry import converging_point
 
 Array = NDArray[np.float64]
-
-NEAR_SHARE = 0.4  # of the cameras' distance to the scene: no density is nearer to them in contracted scenes
-# Sines of the angle between a camera's axis and the direction to a point.
-ASTRAY = 0.3  # a camera further off than this may be an outlier
-AGREED = 0.15  # half of the cameras are within this of a true meeting point
-ASIDE = 0.7  # half of them are further than this from a point where they do not meet
-MOST_TRIED = 32  # cameras whose pairs are tried if no meeting point was found
-FAR = 10.0  # times the usual distance between cameras: nearer ones belong together
-PLAIN = 8  # of 255: a plain background varies by no more than this
 
 
 @dataclass(frozen=True)
@@ -78,13 +70,14 @@ def scene_box(
         center = np.asarray(center_m, dtype=np.float64)
     elif point is not None:
         center = point
-    elif len(views) > 1 and np.linalg.norm(axes.mean(axis=0)) < 0.5:
+    elif len(views) > 1 and np.linalg.norm(axes.mean(axis=0)) < tuned.OUTWARDS:
         center = _main_group(origins).mean(axis=0)  # looking outwards
     else:
         # Nothing tells how far the scene is: a few times the group's own extent, or a room's width.
         group = _main_group(origins)
         spread = float(np.linalg.norm(group - group.mean(axis=0), axis=1).max())
-        center = group.mean(axis=0) + axes.mean(axis=0) * (3.0 * spread if spread > 1e-3 else 3.0)
+        ahead_m = tuned.GUESSED_SPREADS * spread if spread > 1e-3 else tuned.GUESSED_M
+        center = group.mean(axis=0) + axes.mean(axis=0) * ahead_m
     distance = float(np.median(np.linalg.norm(origins - center, axis=1)))
     distance = distance if distance > 1e-6 else 1.0
     pixel = distance / float(np.median([v.intrinsics.fx for v in views]))
@@ -94,7 +87,8 @@ def scene_box(
     if radius_m is None:
         radius_m = distance if contracted else _seen_radius(views, center)
     if near_m is None:
-        near_m = NEAR_SHARE * distance if contracted else max(0.05 * distance, distance - 1.8 * radius_m)
+        before = max(tuned.NEAR_LEAST * distance, distance - tuned.NEAR_RADII * radius_m)
+        near_m = tuned.NEAR_SHARE * distance if contracted else before
     x, y, z = map(float, center)
     return SceneBox((x, y, z), float(radius_m), float(near_m), contracted, distance, pixel)
 
@@ -115,7 +109,7 @@ def _meeting_point(origins: Array, axes: Array) -> Array | None:
         if others is None:
             break
         past = _off_axis(origins, axes, others)
-        if past[worst] < max(ASTRAY, 4.0 * float(np.median(past[kept]))):
+        if past[worst] < max(tuned.ASTRAY, tuned.ASTRAY_MEDIANS * float(np.median(past[kept]))):
             break
         point = others
     if point is not None and _agreed(origins, axes, point):
@@ -124,12 +118,12 @@ def _meeting_point(origins: Array, axes: Array) -> Array | None:
     better = _where_most_meet(origins, axes)
     if better is not None or point is None:
         return better
-    return point if np.median(_off_axis(origins, axes, point)) < ASIDE else None
+    return point if np.median(_off_axis(origins, axes, point)) < tuned.ASIDE else None
 
 
 def _where_most_meet(origins: Array, axes: Array) -> Array | None:
     """The point where at least three quarters of the cameras look, if any, found by trying pairs of them."""
-    some = np.unique(np.linspace(0, len(origins) - 1, MOST_TRIED).astype(int))
+    some = np.unique(np.linspace(0, len(origins) - 1, tuned.MOST_TRIED).astype(int))
     i, j = (some[k] for k in np.triu_indices(len(some), 1))
     projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     both = projectors[i] + projectors[j]
@@ -141,8 +135,8 @@ def _where_most_meet(origins: Array, axes: Array) -> Array | None:
     astray = np.median(_off_axis(origins, axes, points), axis=-1)
     first = int(np.argmin(astray))
     past = _off_axis(origins, axes, points[first])
-    kept = past <= max(ASTRAY, 4.0 * float(astray[first]))
-    if astray[first] >= AGREED or 4 * np.count_nonzero(~kept) > len(origins):
+    kept = past <= max(tuned.ASTRAY, tuned.ASTRAY_MEDIANS * float(astray[first]))
+    if astray[first] >= tuned.MEETS or 4 * np.count_nonzero(~kept) > len(origins):
         return None
     point = converging_point(origins[kept], axes[kept])
     # From very far away, a camera may look past the point by kilometers at a small angle.
@@ -150,7 +144,7 @@ def _where_most_meet(origins: Array, axes: Array) -> Array | None:
 
 
 def _agreed(origins: Array, axes: Array, point: Array) -> bool:
-    return bool(np.median(_off_axis(origins, axes, point)) < AGREED)
+    return bool(np.median(_off_axis(origins, axes, point)) < tuned.MEETS)
 
 
 def _off_axis(origins: Array, axes: Array, point: Array) -> Array:
@@ -164,7 +158,7 @@ def _off_axis(origins: Array, axes: Array, point: Array) -> Array:
 def _main_group(origins: Array) -> Array:
     """The positions of the cameras without those far from the others; all, if those are over a quarter."""
     apart = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
-    kept = apart <= FAR * max(float(np.median(apart)), 1e-3)
+    kept = apart <= tuned.FAR_AWAY * max(float(np.median(apart)), 1e-3)
     return origins[kept] if 4 * np.count_nonzero(~kept) <= len(origins) else origins
 
 
@@ -177,8 +171,9 @@ def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:
         image = view.image
         edges.append(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).astype(np.int16))
     color = np.median(np.concatenate(edges), axis=0)
-    plain = [(np.abs(edge - color).max(axis=-1) <= PLAIN).mean() for edge in edges]
-    return (color / 255.0).astype(np.float32) if np.percentile(plain, 20) >= 0.6 else None
+    plain = [(np.abs(edge - color).max(axis=-1) <= tuned.PLAIN_STEPS).mean() for edge in edges]
+    enough = np.percentile(plain, tuned.PLAIN_PERCENTILE) >= tuned.PLAIN_EDGE
+    return (color / 255.0).astype(np.float32) if enough else None
 
 
 def _seen_radius(views: Sequence[View], center: Array) -> float:
@@ -189,4 +184,4 @@ def _seen_radius(views: Sequence[View], center: Array) -> float:
         half = min(0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy)
         distance = np.linalg.norm(view.camera_to_world[:3, 3] - center)
         radii.append(distance * half / np.hypot(1.0, half))
-    return max(float(np.percentile(radii, 10)), 1e-6)
+    return max(float(np.percentile(radii, tuned.SEEN_PERCENTILE)), 1e-6)

@@ -1,5 +1,5 @@
-"""Settings that representations share: options, whose texts become help and error messages, and numbers that
-were tuned once, which are no options: they have no text.
+"""Settings that representations share: options, whose texts become help and error messages, and what was tuned once
+for each representation, which is no option: it has no text.
 """
 
 from __future__ import annotations
@@ -13,23 +13,7 @@ from msgspec import Meta
 
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 
-BETA1, BETA2 = 0.9, 0.99  # of Adam
-# The first of encodings and their networks: a first fit has a hundred steps or so, and with .9 a tenth of them pass
-# before Adam forgets the gradients of fog that is gone.
-BETA1_FIELD = 0.65
-NOMINAL_RAYS = 4096.0  # gradients are scaled as if a step had so many rays: Adam's epsilon keeps its meaning
 BATCH = 2048  # ``kernels.train.CHUNK``, samples; settings do not load kernels
-FIRST_DENSITY = 0.3  # a scene unit of fog dims by a quarter: every sample gets a gradient at first
-FINAL_BOX_CAMERAS = 4  # cameras from which on a scene's box is kept
-
-# What moved: pixels that differ by more, of 255, after blurring, above the noise of sensors and of video compression;
-# and those around them.
-CHANGE, MARGIN_PX = 16, 2
-
-# The depth guide: its weight where the settings leave it open; views up to which it is used in any scene; share of a
-# budget in seconds that its plane sweep may take; distance of weight from it, as a share of its own distance, at which
-# that costs half of the most.
-GUIDE_WEIGHT, FEW_VIEWS, SWEEP_SHARE, GUIDE_REACH = 0.1, 6, 0.5, 0.04
 
 ShDegree = Annotated[Literal[0, 1], about("degree of the spherical harmonics of color; 0: the same from everywhere")]
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, FitReport, Rendering, Snapshot, View
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.field_state import all_or_nothing, pack_state, unpack_meta
 from edge_server.fields.common.threads.fair_lock import FairLock
 from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels, shared_pool
@@ -90,7 +91,7 @@ class SteppedField(ABC, Generic[S]):
         step_budget = StepBudget(budget, self.now)
         one_step = self._begin_fit(views, step_budget)
         rays = samples = dropped = 0
-        losses: deque[float] = deque(maxlen=32)
+        losses: deque[float] = deque(maxlen=tuned.LOSS_STEPS)
         while (progress := step_budget.begin_step(self._step_time)) is not None:
             with self._lock:
                 loss, seen, used, lost = one_step(progress)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.settings import CHANGE, MARGIN_PX
 from freshfield.geometry import GeometryError, Pinhole, Pose, invertible
 from freshfield.limits import MAX_CENTER_OUTSIDE_SIDES
 
@@ -90,10 +90,10 @@ def moved_pixels(before: View, now: View) -> NDArray[np.bool_] | None:
     most = channels[0]
     for channel in channels[1:]:
         most = cv2.max(most, channel)
-    moved = (most > CHANGE).astype(np.uint8)
+    moved = (most > tuned.CHANGE).astype(np.uint8)
     if not moved.any():
         return None
-    size = 2 * MARGIN_PX + 1
+    size = 2 * tuned.MARGIN_PX + 1
     return cv2.dilate(moved, np.ones((size, size), np.uint8)).astype(bool)
 
 
@@ -107,7 +107,7 @@ def remember_views(memory: dict[str, CameraMemory], views: Sequence[View]) -> tu
             continue
         stood = known is not None and (
             known.view.intrinsics == view.intrinsics
-            and np.allclose(known.view.camera_to_world, view.camera_to_world, atol=1e-3)
+            and np.allclose(known.view.camera_to_world, view.camera_to_world, atol=tuned.SAME_POSE)
         )
         news = news or not stood
         moved, same = None, False

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.cameras.camera_refinement import CameraRefinement
 from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.adam import PART, Rule, adam
@@ -25,18 +26,10 @@ from edge_server.fields.common.kernels.mlp import Net, init_net
 from edge_server.fields.common.kernels.rays import Space, Views
 from edge_server.fields.common.kernels.train import CHUNK, CHUNK_RAYS, ROW, Batch, RaySampling, Scratch, train_chunks
 from edge_server.fields.common.kernels.volume_rendering import Weights
-from edge_server.fields.common.occupancy_grid import EVERY, OccupancyGrid
+from edge_server.fields.common.occupancy_grid import OccupancyGrid
 from edge_server.fields.common.ray_snapshot import RaySnapshot
 from edge_server.fields.common.scene_box import UNIT_BOX, SceneBox
-from edge_server.fields.common.settings import (
-    BATCH,
-    BETA1_FIELD,
-    BETA2,
-    FEW_VIEWS,
-    GUIDE_WEIGHT,
-    NOMINAL_RAYS,
-    SWEEP_SHARE,
-)
+from edge_server.fields.common.settings import BATCH
 from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer, step_key, step_length
@@ -158,13 +151,13 @@ class TrainedField(SteppedField[RaySnapshot]):
         if weight is None:
             # With many cameras in a room, a field is as good without a guide, sooner or later.
             plain = self.view_store.background_is_plain and s.background == "auto"
-            weight = GUIDE_WEIGHT if plain or len(supervising_views(data)) <= FEW_VIEWS else 0.0
+            weight = tuned.GUIDE_WEIGHT if plain or len(supervising_views(data)) <= tuned.FEW_VIEWS else 0.0
         # Cameras do not agree while their appearances and poses are still to be learned.
         self._guide_weight = 0.0 if self._cameras.enabled else weight
         if self._present_guide_weight() == 0.0:
             return data
         if self._swept is None or not same_views(views, self._swept[0]):
-            if not step_budget.has_room(self._sweep_timer.seconds, SWEEP_SHARE, self._step_time.seconds):
+            if not step_budget.has_room(self._sweep_timer.seconds, tuned.SWEEP_SHARE, self._step_time.seconds):
                 return data
             # Imported here: other scenes need neither load nor compile it.
             from edge_server.fields.common.plane_sweep import depth_guide
@@ -231,9 +224,11 @@ class TrainedField(SteppedField[RaySnapshot]):
         s, levels, box = self.settings, self._levels(), self.view_store.box
         assert box is not None
         key = step_key(s.seed, self.step)
-        if self.step % EVERY == 0:
+        if self.step % tuned.OCCUPANCY_EVERY == 0:
             model = self._encoding, levels, self._net
-            self._occupancy.refresh(self.pool, key, self.step // EVERY, model, self._scratch.acts, self._scratch_x)
+            self._occupancy.refresh(
+                self.pool, key, self.step // tuned.OCCUPANCY_EVERY, model, self._scratch.acts, self._scratch_x
+            )
         space: Space = self._occupancy.space(step_length(self.settings, self.step))
         batch = self._batch
         ray_sampling = RaySampling(
@@ -265,12 +260,12 @@ class TrainedField(SteppedField[RaySnapshot]):
         updates, fall = self.step + 1, s.rate_end**progress
         rule = Rule(
             rate=np.float32(s.rate * fall),
-            beta1=np.float32(BETA1_FIELD),
-            beta2=np.float32(BETA2),
+            beta1=np.float32(tuned.BETA1_FIELD),
+            beta2=np.float32(tuned.BETA2),
             epsilon=np.float32(s.epsilon),
-            scale=np.float32(NOMINAL_RAYS / rays),
-            correct1=np.float32(1.0 / (1.0 - BETA1_FIELD**updates)),
-            correct2=np.float32(1.0 / (1.0 - BETA2**updates)),
+            scale=np.float32(tuned.NOMINAL_RAYS / rays),
+            correct1=np.float32(1.0 / (1.0 - tuned.BETA1_FIELD**updates)),
+            correct2=np.float32(1.0 / (1.0 - tuned.BETA2**updates)),
         )
         rule_net = rule._replace(rate=np.float32(s.rate_net * fall))
         self.pool.run(

@@ -10,9 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 from edge_server.fields import Budget
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.settings import TrainerSettings
-
-LATE = 1.1  # times a budget in seconds: a fit may end so late rather than make no step
 
 
 def step_key(seed: int, step: int) -> np.uint64:
@@ -32,7 +31,7 @@ class StepTimer:
     0 before the first. Kept from one fit to the next."""
 
     def __init__(self) -> None:
-        self._latest_s: deque[float] = deque(maxlen=5)
+        self._latest_s: deque[float] = deque(maxlen=tuned.STEP_TIMES)
 
     @property
     def seconds(self) -> float:
@@ -92,7 +91,7 @@ class StepBudget:
             return self._progress(timer, self.steps, self._budget.steps) if left else None
         assert self._budget.seconds is not None
         spent, first = self._step_start - self._start, timer not in self._made
-        most = self._budget.seconds * (LATE if first else 1.0)
+        most = self._budget.seconds * (tuned.LATE if first else 1.0)
         if spent + timer.seconds <= most:
             return self._progress(timer, spent, self._budget.seconds)
         if first:

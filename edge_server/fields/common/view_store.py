@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox, plain_background, scene_box
-from edge_server.fields.common.settings import FINAL_BOX_CAMERAS, FieldSettings
+from edge_server.fields.common.settings import FieldSettings
 from edge_server.fields.common.supervision import CameraMemory, check_view, pack_views, remember_views
 from freshfield.geometry import Pinhole
 
@@ -58,7 +59,7 @@ class ViewStore:
             check_view(view)
         visibility_changed, has_new_images = remember_views(self.memory, views)
         box_changed = False
-        if self.box is None or self._box_cameras < min(len(self.memory), FINAL_BOX_CAMERAS):
+        if self.box is None or self._box_cameras < min(len(self.memory), tuned.FINAL_BOX_CAMERAS):
             # Two or three cameras say little about where the scene is: find it anew when there are more.
             s = self.settings
             box = scene_box(self.views, s.center_m, s.radius_m, s.near_m, s.contracted)
@@ -74,7 +75,7 @@ class ViewStore:
 
     def keep_box(self) -> None:
         """Keep the scene's box, whatever cameras come."""
-        self._box_cameras = FINAL_BOX_CAMERAS
+        self._box_cameras = tuned.FINAL_BOX_CAMERAS
 
     def forget_views(self) -> None:
         """Forget the views; box and background stay."""
@@ -163,4 +164,5 @@ def _check_box(box: SceneBox) -> None:
 
 def _similar(a: SceneBox, b: SceneBox) -> bool:
     apart = float(np.linalg.norm(np.subtract(a.center_m, b.center_m)))
-    return apart < 0.1 * b.radius_m and abs(a.radius_m - b.radius_m) < 0.1 * b.radius_m
+    near = tuned.SIMILAR_BOX * b.radius_m
+    return apart < near and abs(a.radius_m - b.radius_m) < near

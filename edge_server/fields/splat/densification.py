@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from edge_server.fields.splat.kernels.optimizer_step import DEAD, OptimizerState, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, SH_COLUMNS, Gaussians
-from edge_server.fields.splat.settings import GROW_SHARE, PRUNE_OPACITY, SHARP_PX, SPLIT_SHRINK, WIDEST, SplatSettings
+from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.tuned_numbers import (
+    GROW_SHARE,
+    PRUNE_OPACITY,
+    SHARP_PX,
+    SPLIT_APART,
+    SPLIT_SHRINK,
+    WIDEST,
+)
 from freshfield.geometry import quaternion_to_matrix
 
 
@@ -114,8 +122,8 @@ def _split(cloud: GaussianCloud, chosen: NDArray[np.int64], pixels: float, rng: 
     one[:, SCALE : SCALE + 3] -= np.where(wide, np.log(SPLIT_SHRINK), 0.0)[:, None]
     one[:, OPACITY] = raw_opacity(1.0 - np.sqrt(1.0 - opacity(one)))
     two = one.copy()
-    one[:, :3] += 0.5 * offset
-    two[:, :3] -= 0.5 * offset
+    one[:, :3] += SPLIT_APART * offset
+    two[:, :3] -= SPLIT_APART * offset
     for half in (one, two):
         clamp_gaussians(half)
     cloud.params[chosen] = one

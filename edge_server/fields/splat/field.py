@@ -32,16 +32,16 @@ from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, SH_COLUMNS, TILE
 from edge_server.fields.splat.kernels.rasterize import LOSSES, Targets
 from edge_server.fields.splat.seeding import seed_gaussians
-from edge_server.fields.splat.settings import (
+from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.snapshot import SplatSnapshot
+from edge_server.fields.splat.tuned_numbers import (
     RATE_COLOR,
     RATE_OPACITY,
     RATE_POSITION,
     RATE_ROTATION,
     RATE_SCALE,
     RATE_SH,
-    SplatSettings,
 )
-from edge_server.fields.splat.snapshot import SplatSnapshot
 
 
 class StillField(SteppedField[SplatSnapshot]):

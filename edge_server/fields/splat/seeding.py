@@ -15,7 +15,8 @@ from edge_server.fields.common.supervision import pack_cameras, supervising_view
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, SH_COLUMNS
-from edge_server.fields.splat.settings import SEED_CANDIDATES, SEED_OPACITY, SEED_SCALE, SplatSettings
+from edge_server.fields.splat.settings import SplatSettings
+from edge_server.fields.splat.tuned_numbers import SEED_CANDIDATES, SEED_MOST_SEE, SEED_OPACITY, SEED_SCALE, SEED_VIEWS
 
 
 def seed_gaussians(
@@ -54,7 +55,8 @@ def seed_gaussians(
         return params
     focal = data.lens[:, 0]
     # Several views see each place: the spacing in space is that of the rays of all of them.
-    spacing = np.sqrt(where.size / found.size / min(max(len(views) / 3.0, 1.0), 6.0))
+    see = min(max(len(views) / SEED_VIEWS, 1.0), SEED_MOST_SEE)
+    spacing = np.sqrt(where.size / found.size / see)
     view_of, local, distance = view_of[found], local[found], distance[found]
     for v in np.unique(view_of):
         mine, lens = np.flatnonzero(view_of == v), views[v].intrinsics

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE
 from edge_server.fields.splat.planar import unit_quaternions
-from edge_server.fields.splat.settings import LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
+from edge_server.fields.splat.tuned_numbers import LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
 from edge_server.page.splats.tuned_numbers import COLOR_LOW, COLOR_STEP
 
 RECORD = np.dtype([("place", "<u2", 3), ("scale", "u1", 3), ("turn", "u1", 3), ("color", "u1", 3), ("alpha", "u1")])

@@ -15,7 +15,7 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
-from edge_server.surface import settings as tuned
+from edge_server.surface import tuned_numbers as tuned
 from edge_server.surface.kernels.patch_images import depth_shown, offset_to, project, within
 
 LANES = 32  # taps of a patch: 5 x 5 and four farther ones; the rest weigh nothing
@@ -55,7 +55,7 @@ def choose_sources(counter, worker, images, view, planes):
                         continue
                     off = (apart - tuned.BEST_DEG) / tuned.SPREAD_DEG
                     facing = -(ex * nx + ey * ny + ez * nz) / far
-                    good = np.exp(-0.5 * off * off) * min(1.0, max(2.0 * facing, 0.2))
+                    good = np.exp(-0.5 * off * off) * min(1.0, max(tuned.FACING * facing, tuned.FACING_LEAST))
                     if good > score[tuned.SOURCES - 1]:
                         i = tuned.SOURCES - 1
                         while i > 0 and good > score[i - 1]:
@@ -159,7 +159,7 @@ def plane_cost(images, view, row, column, d, nx, ny, nz, across, down, patch, we
         other = max(square - level * level / total, np.float32(0.0)) / total
         like = cross / total / np.sqrt((spread + tuned.NOISE) * (other + tuned.NOISE))
         cost = (np.float32(1.0) - tuned.DIFFERENCE) * (np.float32(1.0) - like)
-        cost += tuned.DIFFERENCE * min(change / total / levels, np.float32(2.0))
+        cost += tuned.DIFFERENCE * min(change / total / levels, tuned.MOST_LEVELS)
         if geometric > 0.0:
             cost += np.float32(geometric * _way_back(images, k, s, row, column, u, v, x, y, z))
         if cost < one:
@@ -260,7 +260,7 @@ def match(counter, worker, images, view, guess, planes, parity, key, search):
                     qx, qy, qz = normals[trial - 1, 0], normals[trial - 1, 1], normals[trial - 1, 2]
                 elif trial > 8:
                     wide = trial < 9 + search.wide
-                    small = 0.25 if trial >= 12 + search.wide else 1.0
+                    small = tuned.SMALLER if trial >= 12 + search.wide else 1.0
                     kind = -1 if wide else (trial - search.wide) % 3  # 0: depth, 1: normal, 2: both
                     if kind != 1:
                         drawn = 2.0 * np.float64(uniform(key, n)) - 1.0
@@ -335,7 +335,7 @@ def confirm(counter, worker, images, view, planes, share, agree, against, rise):
                 tolerance = (share + 1.0 / min(images.lens[s, 0], images.lens[s, 1])) * far
                 if abs(shown - far) <= tolerance:
                     agree[row, column] += 1
-                elif shown > far + 2.0 * tolerance:
+                elif shown > far + tuned.THROUGH * tolerance:
                     against[row, column] += 1
             facts = _take_patch(view.gray, row, column, across, down, fade, patch, weight)
             nx = np.float64(planes.normal[row, column, 0])

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
+from camera_node import tuned_numbers as tuned
 from camera_node.synthetic import SCENES, frame_cache, make_scene
 from camera_node.synthetic import source as source_module
 from camera_node.synthetic.depth import DepthRenderer
@@ -208,7 +209,7 @@ def test_the_first_frame_a_process_writes_makes_room_and_the_longest_unused_goes
     assert prune(tmp_path, keep=tmp_path / f"{0:032x}", limit_bytes=2500) == 2000
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"{0:032x}", f"{3:032x}", "models"]
     monkeypatch.setattr(frame_cache, "_pruned", set())
-    monkeypatch.setattr(frame_cache, "MAX_DISK_BYTES", 1000)
+    monkeypatch.setattr(tuned, "RENDERED_DISK_BYTES", 1000)
     source(folder=tmp_path).prepare(lambda: False)
     assert not (tmp_path / f"{0:032x}").exists() and len(files(tmp_path)) == 9 + 2
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from channel_emu.live.proxy import ProxyOptions
-from channel_emu.live.tcp_proxy import BEHIND, PIECE_BYTES, TIMEOUT_S, TcpProxy
+from channel_emu.live.tcp_proxy import TcpProxy
+from channel_emu.live.tuned_numbers import PIECE_BYTES, PIECES_BEHIND, RESEND_AFTER_S
 from channel_emu.model.settings import channel_from_mapping
 from freshfield.transport import TransportError
 from tests.support import free_port, until
@@ -73,7 +74,7 @@ async def test_each_piece_takes_a_service_time_and_a_lost_one_a_timeout():
     async with echo({"service": "det:1ms", "faults": {"blackout": {"windows_ms": [[0.0, 300.0]]}}}) as proxy:
         began = time.monotonic()
         assert await through(proxy, b"once") == b"once"
-        assert time.monotonic() - began > TIMEOUT_S
+        assert time.monotonic() - began > RESEND_AFTER_S
         assert proxy.report().by_method["up bytes"].outcomes["lost"] >= 1
 
 
@@ -82,9 +83,9 @@ async def test_a_sender_waits_for_a_slow_link():
     async with echo({"service": "det:60s"}) as proxy:
         _, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
         writer.write(bytes(100 * PIECE_BYTES))
-        await until(lambda: "up bytes" in proxy.links and proxy.links["up bytes"].model.offered >= BEHIND)
+        await until(lambda: "up bytes" in proxy.links and proxy.links["up bytes"].model.offered >= PIECES_BEHIND)
         await asyncio.sleep(0.2)
-        assert proxy.links["up bytes"].model.offered == BEHIND
+        assert proxy.links["up bytes"].model.offered == PIECES_BEHIND
         writer.close()
 
 

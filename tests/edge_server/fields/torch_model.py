@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES
-from edge_server.fields.common.kernels.volume_rendering import OPAQUE_DEPTH, RAW_HIGH, RAW_LOW
+from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
+from edge_server.fields.common.tuned_numbers import OPAQUE_DEPTH
 
 
 def to_torch(grid: Any) -> Any:

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.surface import SurfaceError, settings
+from edge_server.surface import SurfaceError
+from edge_server.surface import tuned_numbers as tuned
 from edge_server.surface import volume as volume_module
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.fuse import SIDE
@@ -65,7 +66,7 @@ def test_bounds_are_those_of_what_is_seen():
 
 def test_distances_are_those_of_the_ball_with_a_slope_of_one(monkeypatch):
     for name, value in (("LEVELS", 2), ("POINTS", 4000), ("EIKONAL", 0.3)):
-        monkeypatch.setattr(settings, f"SDF_{name}", value)
+        monkeypatch.setattr(tuned, f"SDF_{name}", value)
     volume = fit_sdf(COARSE, balls.ball_maps(16))
     truth = np.linalg.norm(balls.voxel_points(volume), axis=-1) - balls.RADIUS_M
     assert np.abs(volume.blocks.distance - truth)[np.abs(truth) < 0.01].mean() < 0.0015
@@ -80,7 +81,7 @@ def test_distances_are_those_of_the_ball_with_a_slope_of_one(monkeypatch):
 
 def test_the_number_of_threads_changes_no_bit_of_a_distance_function(monkeypatch):
     for name, value in (("LEVELS", 2), ("STEPS", 10), ("POINTS", 2000)):
-        monkeypatch.setattr(settings, f"SDF_{name}", value)
+        monkeypatch.setattr(tuned, f"SDF_{name}", value)
     maps, found = balls.ball_maps(4), []
     for threads in (1, 2, torch.get_num_threads()):  # as it was, at last
         torch.set_num_threads(threads)

@@ -9,13 +9,14 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.surface import settings
+from edge_server.surface import tuned_numbers as tuned
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
 from edge_server.surface.kernels.patch_images import Planes
 from edge_server.surface.reconstruct import covering_maps, make_depth_maps
 from edge_server.surface.refine_depth import _images, _view, exposures, refine_depth
-from edge_server.surface.settings import REACH, UNSURE, MeshSettings
+from edge_server.surface.settings import MeshSettings
+from edge_server.surface.tuned_numbers import REACH, UNSURE
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 LENS = Pinhole.from_fov(72, 72, 45.0)
@@ -125,16 +126,16 @@ def test_the_cost_is_that_of_plain_numpy(rig):
     at = LENS.project((points - pose[:3, 3]) @ pose[:3, :3])
     other = map_coordinates(gray[1].astype(float), [at[:, 1] - 0.5, at[:, 0] - 0.5], order=1)
     own = gray[0][row + j, column + i].astype(float)
-    w = np.exp(-np.abs(own - gray[0][row, column]) / settings.SIMILAR - settings.FADE * (i * i + j * j))
+    w = np.exp(-np.abs(own - gray[0][row, column]) / tuned.SIMILAR - tuned.FADE * (i * i + j * j))
     w /= w.sum()
     a, b = own - w @ own, other - w @ other
-    like = (w @ (a * b)) / np.sqrt((w @ a**2 + settings.NOISE) * (w @ b**2 + settings.NOISE))
-    levels = settings.LEVELS + np.sqrt(w @ a**2)
+    like = (w @ (a * b)) / np.sqrt((w @ a**2 + tuned.NOISE) * (w @ b**2 + tuned.NOISE))
+    levels = tuned.LEVELS + np.sqrt(w @ a**2)
     unlike = min(w @ np.abs(own - other) / levels, 2.0)
-    wanted = (1 - settings.DIFFERENCE) * (1 - like) + settings.DIFFERENCE * unlike
+    wanted = (1 - tuned.DIFFERENCE) * (1 - like) + tuned.DIFFERENCE * unlike
     assert found == pytest.approx(wanted, abs=0.02) and shown == 1
     away = patch_match.plane_cost(images, view, row, column, depth, *-normal, *taps)
-    assert away == (settings.WORST, 0), "turned away"
+    assert away == (tuned.WORST, 0), "turned away"
 
 
 def test_unknown_pixels_take_the_nearest_depth_and_empty_ones_none(rig):

@@ -34,6 +34,7 @@ from camera_node.robot.calibration.tuned_numbers import (
     NOTABLE_SCALE,
     POSES_FOR_SCALE,
     SURE,
+    WARNED_OUTLIERS,
     WORST_DEG,
     WORST_MM,
 )
@@ -208,7 +209,7 @@ def _warnings(samples: Samples, refined: Refinement, off: Residuals, spread: Div
     if median_mm > LARGE_RESIDUAL_MM or median_deg > LARGE_RESIDUAL_DEG:
         out.append(f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}")
     noticed = [i for i in refined.outliers if off.mm[i] > NOTABLE_MM or off.deg[i] > NOTABLE_DEG]
-    for i in noticed[:5]:
+    for i in noticed[:WARNED_OUTLIERS]:
         out.append(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "
             f"degrees) and counts for {refined.weights[i]:.2f}"

@@ -23,7 +23,16 @@ from scipy.optimize import least_squares
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration.hand_eye.closed_form import start as closed_form_start
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, rotation_vectors
-from camera_node.robot.calibration.tuned_numbers import DEGREES_OF_FREEDOM, MIN_NOISE, OUTLIER_WEIGHT, ROUNDS, SETTLED
+from camera_node.robot.calibration.tuned_numbers import (
+    DEGREES_OF_FREEDOM,
+    MIN_NOISE,
+    NOISE_SETTLED,
+    NOISE_STEPS,
+    OUTLIER_WEIGHT,
+    ROUNDS,
+    SETTLED,
+    SMALLEST_LIKELIHOOD_GAIN,
+)
 from freshfield.geometry import se3, se3_inverse
 
 
@@ -70,7 +79,7 @@ def refine(samples: Samples, with_scale: bool = False) -> Refinement:
             start,
             x_scale="jac",
             loss=_student_t,
-            ftol=1e-10,
+            ftol=SMALLEST_LIKELIHOOD_GAIN,
         )
         e = residuals(solved.x)
         x, y = _retract(x, solved.x[:6]), _retract(y, solved.x[6:12])
@@ -121,10 +130,10 @@ def _noise(e: Array, noise: Array) -> Array:
     three coordinates a sample, six parameters are taken as fitted."""
     squares = (e**2).reshape(-1, 2, 3).sum(axis=2)
     freedom = max(3 * len(e) - 6, 1)
-    for _ in range(100):
+    for _ in range(NOISE_STEPS):
         before = noise
         noise = np.maximum(np.sqrt(_weights(e, noise) @ squares / freedom), MIN_NOISE)
-        if np.abs(noise / before - 1.0).max() < 0.1 * SETTLED:
+        if np.abs(noise / before - 1.0).max() < NOISE_SETTLED:
             break
     return noise
 

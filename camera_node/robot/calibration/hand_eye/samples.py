@@ -15,10 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.tuned_numbers import HALF_TURN_MARGIN_DEG, MIN_POSES, MIN_SPREAD_DEG, MIN_TURN_DEG
+from camera_node.robot.calibration.tuned_numbers import (
+    HALF_TURN_MARGIN_DEG,
+    MAX_SAMPLES,
+    MIN_POSES,
+    MIN_SPREAD_DEG,
+    MIN_TURN_DEG,
+)
 from freshfield.geometry import Array, se3_inverse
-
-_MAX_SAMPLES = 80  # have 3160 pairs
 
 
 @dataclass(frozen=True)
@@ -112,7 +116,7 @@ class Diversity:
 
 def diversity(samples: Samples) -> Diversity:
     """Examine the motions between all pairs of samples (of at most 80)."""
-    chosen = samples.subsample(_MAX_SAMPLES)
+    chosen = samples.subsample(MAX_SAMPLES)
     if len(chosen) < 2:
         return Diversity(0, 0, 0.0, 0.0, _too_few(len(samples)))
     first, second = np.triu_indices(len(chosen), 1)

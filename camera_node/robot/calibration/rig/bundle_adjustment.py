@@ -15,6 +15,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 from camera_node.robot.calibration.targets import Array, Corners
 from camera_node.robot.calibration.tuned_numbers import (
+    DAMPING_FACTOR,
     FIRST_DAMPING,
     LAST_DAMPING,
     MOST_STEPS,
@@ -113,10 +114,10 @@ def _minimize(problem: _Problem, start: Array) -> Array:
             tried = problem.residuals(stepped)
             if (loss := _huber(tried)) < before:
                 break
-            damping *= 10
+            damping *= DAMPING_FACTOR
         else:
             break
-        values, residuals, damping = stepped, tried, damping / 10
+        values, residuals, damping = stepped, tried, damping / DAMPING_FACTOR
         if before - loss < SMALLEST_GAIN * before:
             break
     return values

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.datasets.imaging import decode_file, read_numbers, shrink
 from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import Photo
@@ -21,8 +22,6 @@ import cv2  # isort: skip
 
 MILLIMETER = 0.001
 _MOST_COUNTS = 65535
-# Tolerated difference of aspect ratio between depth and the image it is registered to, both in whole pixels.
-_SAME_SHAPE = 0.05
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def registered(counts: NDArray[np.uint16], lens: Lens, scale: float, where: str)
     """Depth that is registered to images of ``lens``, undistorted and shrunk by ``scale`` as they are, and no larger.
     Raises DatasetError if it has another shape."""
     height, width = counts.shape
-    if abs((width / lens.width) / (height / lens.height) - 1.0) > _SAME_SHAPE:
+    if abs((width / lens.width) / (height / lens.height) - 1.0) > tuned.SAME_DEPTH_SHAPE:
         raise DatasetError(
             f"{where}: depth is {_size(counts)}, its image {lens.width} x {lens.height}: another shape; register it "
             "to the image"

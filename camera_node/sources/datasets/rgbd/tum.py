@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.pose.providers import PoseGapError, read_tum
+from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
@@ -23,7 +24,6 @@ from freshfield.untrusted import read_text
 
 FILES = ("rgb.txt",)
 METERS_PER_COUNT = 1.0 / 5000.0
-_NEAR_NS = 20_000_000
 # Published with pixel centers at whole numbers, so .5 is added.
 _LENS = Lens(640, 480, 525.0, 525.0, 320.0, 240.0)
 _FREIBURG3 = Lens(640, 480, 535.4, 539.2, 320.6, 248.1)
@@ -32,7 +32,7 @@ _FREIBURG3 = Lens(640, 480, 535.4, 539.2, 320.6, 248.1)
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     """The images of a sequence's folder, or of its ``rgb.txt``. Raises DatasetError."""
     folder = path if path.is_dir() else path.parent
-    poses = read_tum(folder / "groundtruth.txt", interpolate=False, max_gap_ns=_NEAR_NS)
+    poses = read_tum(folder / "groundtruth.txt", interpolate=False, max_gap_ns=tuned.TUM_NEAR_NS)
     listed = _listed(folder / "rgb.txt")
     depth = dict(_listed(folder / "depth.txt"))
     times = np.array(sorted(depth), dtype=np.int64)
@@ -45,13 +45,13 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
         except PoseGapError:
             unposed += 1
             continue
-        nearest = int(times[np.abs(times - t_ns).argmin()]) if times.size else t_ns + 2 * _NEAR_NS
+        nearest = int(times[np.abs(times - t_ns).argmin()]) if times.size else t_ns + 2 * tuned.TUM_NEAR_NS
         with errors_at(f"{folder / 'depth.txt'}"):
-            measured = file_within(folder, depth[nearest]) if abs(nearest - t_ns) <= _NEAR_NS else None
+            measured = file_within(folder, depth[nearest]) if abs(nearest - t_ns) <= tuned.TUM_NEAR_NS else None
         reader = DepthFile(measured, METERS_PER_COUNT).read if measured else None
         where, time_s = f"{folder / 'rgb.txt'}: {name}", (t_ns - listed[0][0]) / 1e9
         found.add(name, name, lens, pose.matrix(), where, time_s=time_s, depth=reader)
-    left_out = f"{unposed} of {len(listed)} images have no pose within 20 ms: left out"
+    left_out = f"{unposed} of {len(listed)} images have no pose within {tuned.TUM_NEAR_NS // 10**6} ms: left out"
     if listed and unposed == len(listed):
         raise DatasetError(f"{folder}: {left_out}")
     return found.dataset(notes=[left_out] if unposed else [])

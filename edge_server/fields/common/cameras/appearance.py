@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.cameras import tuned_numbers as tuned
-from edge_server.fields.common.settings import BETA1, BETA2
+from edge_server.fields.common.tuned_numbers import BETA1, BETA2
 
 Array = NDArray[np.float64]
 

@@ -9,10 +9,9 @@ import numpy as np
 from edge_server.fields.common.kernels.hash_grid import SEGMENT
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add, is_finite
+from edge_server.fields.common.tuned_numbers import GRADIENT_LIMIT, PARAMETER_LIMIT
 
 PART = 512  # segments a task
-GRADIENT_LIMIT = 1e3  # a hundred times what healthy scenes show; keeps the second moment finite
-PARAMETER_LIMIT = 1e2
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 

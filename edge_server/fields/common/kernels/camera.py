@@ -56,7 +56,7 @@ def rotate_to_camera(cam, x, y, z):
 def lens_terms(cam, x, y, z):
     """The projection of a camera point through the lens, and what the Jacobian J and its gradient need:
     x / z, y / z, both clamped, projected u, v, the lens's first and second derivatives, 1 / z. J is taken at
-    the ratios clamped to 1.3 times the field of view."""
+    the ratios clamped to LENS_FIELD times the field of view."""
     inverse = _F1 / z
     a, c = x * inverse, y * inverse
     ta = min(max(a, cam[LIMITS]), cam[LIMITS + 1])

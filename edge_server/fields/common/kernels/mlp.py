@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function
-from edge_server.fields.common.settings import FIRST_DENSITY
+from edge_server.fields.common.tuned_numbers import FIRST_DENSITY, FIRST_OUTPUTS
 
 BLOCK = 256
 # Columns that rows of activations have beyond those that are used. Rows at a distance of a power of two would all lie
@@ -36,7 +36,7 @@ def init_net(inputs: int, outputs: int, hidden: list[int], rng: np.random.Genera
     params, first = np.zeros(int(sum(o * i + o for i, o in pairwise(widths))), np.float32), 0
     for layer, (n_in, n_out) in enumerate(pairwise(widths)):
         last = layer == len(widths) - 2
-        spread = np.sqrt(2.0 / n_in) * (0.1 if last else 1.0)
+        spread = np.sqrt(2.0 / n_in) * (FIRST_OUTPUTS if last else 1.0)
         params[first : first + n_in * n_out] = rng.normal(0.0, spread, int(n_in * n_out))
         if last:
             params[first + n_in * n_out] = np.log(FIRST_DENSITY)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.radiance_model import query_density
 from edge_server.fields.common.kernels.rays import COARSE
@@ -77,15 +78,15 @@ def sample_density(counter, worker, key, phase, phases, fade, encoding, levels, 
 
 @kernel
 def threshold(grid, bound, occupied, coarse):
-    """Mark the cells whose density reaches ``bound``, but never more than .7 of the mean over seen cells:
+    """Mark the cells whose density reaches ``bound``, but never more than OCCUPIED_OF_MEAN of the mean over seen cells:
     a bound that is wrong for the scene must not empty it. grid: ``Cells``. Fills occupied and coarse (uint8)."""
     cells, seen, min_views, density = grid.side, grid.seen, grid.needed, grid.density
     total, count = 0.0, 0
     for cell in range(density.size):
         if seen[cell] >= min_views:
-            total += min(density[cell], 10.0 * bound)
+            total += min(density[cell], tuned.OCCUPIED_MOST * bound)
             count += 1
-    bound = min(bound, 0.7 * total / max(count, 1))
+    bound = min(bound, tuned.OCCUPIED_OF_MEAN * total / max(count, 1))
     coarse[:] = 0
     blocks = cells // COARSE
     for k in range(cells):

@@ -5,18 +5,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from edge_server.fields.common import tuned_numbers as tuned
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, distort, load_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
-from edge_server.fields.common.kernels.rays import HORIZON, origin_of, pixel_direction
+from edge_server.fields.common.kernels.rays import origin_of, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add
 
-MOST_VIEWS = 32  # largest number of views that vote
 NOT_SEEN = -2.0
 # Flags of a pixel. Added up over all views, the first stays below the second.
 SEES, UNMARKED = 1, 256
 _NO_COLOR = 1e3  # times the number of the view: far from every color, and from one another
 _BYTE = np.float32(1.0 / 255.0)
-_EMPTY_VIEWS = 2  # a cell is empty if this many views see plain background there
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
@@ -55,7 +54,7 @@ def _hidden_cells(cams, size, first, flags, nowhere, row, pixels, tally, hidden)
     flags: int32 (P + 1,), one for each pixel: ``SEES``, ``SEES + UNMARKED``, or 0; number P is ``nowhere``,
         with 0. Shape (0,): no cell is hidden.
     row: float32 (3, cells). tally: int32 (cells,), scratch.
-    pixels: int32 (MOST_VIEWS, cells) and hidden: bool (cells,), receive the results.
+    pixels: int32 (SWEEP_VIEWS, cells) and hidden: bool (cells,), receive the results.
     Cells are looked at side by side, since nearly all are hidden: few of many thousands need a closer look.
     """
     total, cells = cams.shape[0], hidden.size
@@ -84,7 +83,7 @@ def _hidden_cells(cams, size, first, flags, nowhere, row, pixels, tally, hidden)
 def score_cells(counter, worker, cams, views, blurred, flags, plain, tolerance, contracted, cells, min_views, scores):
     """How well the cameras agree on the color of each cell. Tasks are layers along z.
 
-    cams: float32 rows of at most MOST_VIEWS cameras; views: ``rays.Views`` of the same. Pixels of weight 0 do
+    cams: float32 rows of at most SWEEP_VIEWS cameras; views: ``rays.Views`` of the same. Pixels of weight 0 do
         not vote. blurred: uint8 (pixels, 3 or 4), the pictures as sharp as the cells.
     flags: see ``_hidden_cells``; (0,): all cells are scored.
     plain: float32 (3,), color of an empty background; (0,): there is none.
@@ -93,9 +92,9 @@ def score_cells(counter, worker, cams, views, blurred, flags, plain, tolerance, 
         where it is hidden, or where background shows.
     """
     total, half = cams.shape[0], np.float32(2.0) if contracted else _F1
-    colors = np.empty((3, MOST_VIEWS), np.float32)
+    colors = np.empty((3, tuned.SWEEP_VIEWS), np.float32)
     red, green, blue = colors[0], colors[1], colors[2]
-    places, pixels = np.empty((3, cells), np.float32), np.empty((MOST_VIEWS, cells), np.int32)
+    places, pixels = np.empty((3, cells), np.float32), np.empty((tuned.SWEEP_VIEWS, cells), np.int32)
     tally, hidden = np.empty(cells, np.int32), np.empty(cells, np.bool_)
     sizes, firsts, weight, nowhere = views.size, views.first, views.weight, blurred.shape[0]
     size = np.float32(2.0) * half / np.float32(cells)
@@ -116,7 +115,7 @@ def score_cells(counter, worker, cams, views, blurred, flags, plain, tolerance, 
                 scores[at] = np.float32(NOT_SEEN)
                 if nothing or hidden[ix]:
                     continue
-                for k in range(MOST_VIEWS):
+                for k in range(tuned.SWEEP_VIEWS):
                     red[k] = green[k] = blue[k] = np.float32(_NO_COLOR * (k + 1))
                 n, empty = 0, 0
                 for v in range(total):
@@ -128,20 +127,20 @@ def score_cells(counter, worker, cams, views, blurred, flags, plain, tolerance, 
                     b = np.float32(blurred[pixel, 2]) * _BYTE
                     red[n], green[n], blue[n] = r, g, b
                     if blurred.shape[1] == 4:
-                        empty += 1 if blurred[pixel, 3] < 16 else 0
+                        empty += 1 if blurred[pixel, 3] < tuned.EMPTY_ALPHA else 0
                     elif plain.size > 0:
                         away = abs(r - plain[0]) + abs(g - plain[1]) + abs(b - plain[2])
-                        empty += 1 if away < np.float32(0.06) else 0
+                        empty += 1 if away < np.float32(tuned.EMPTY_COLOR) else 0
                     n += 1
-                    if empty >= _EMPTY_VIEWS:
+                    if empty >= tuned.EMPTY_VIEWS:
                         break
-                if n < min_views or n == 0 or empty >= min(_EMPTY_VIEWS, n):
+                if n < min_views or n == 0 or empty >= min(tuned.EMPTY_VIEWS, n):
                     continue
                 best = 0
                 for j in range(n):
                     agree = 0
                     r, g, b = red[j], green[j], blue[j]
-                    for k in range(MOST_VIEWS):
+                    for k in range(tuned.SWEEP_VIEWS):
                         agree += np.int32(abs(r - red[k]) + abs(g - green[k]) + abs(b - blue[k]) < tolerance)
                     best = max(best, agree)
                 scores[at] = np.float32(best - 1) / np.float32(n + 1)
@@ -158,7 +157,7 @@ def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted
     """
     half = np.float32(2.0) if contracted else _F1
     size = np.float32(2.0) * half / np.float32(cells)
-    horizon = np.float32(HORIZON) if contracted else _F1
+    horizon = np.float32(tuned.HORIZON) if contracted else _F1
     scale = np.float32(cells) / (np.float32(2.0) * half)
     while True:
         base = fetch_add(counter, 1) * 256
@@ -189,7 +188,7 @@ def sweep_rays(counter, worker, views, view_of, pixels, near, middle, contracted
                     iz = min(np.int64((z * s + half) * scale), cells - 1)
                     score = scores[ix + cells * (iy + cells * iz)]
                     if score > best:  # only then: what is subtracted is never negative
-                        score -= np.float32(0.03) * abs(np.log(t / middle))
+                        score -= np.float32(tuned.SWEEP_MIDDLE) * abs(np.log(t / middle))
                         if score > best:
                             best, at = score, t
                 t += step

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function
+from edge_server.fields.common.tuned_numbers import HORIZON
 
 COARSE = 4  # cells of the occupancy grid a side of one cell of its coarse copy
 NEVER = np.float32(1e30)
-HORIZON = 20.0  # contracted scenes end here, in scene units: nothing behind it moves in any picture
 
 
 class Space(NamedTuple):

@@ -20,13 +20,13 @@ from edge_server.fields.common.kernels.radiance_model import (
 from edge_server.fields.common.kernels.rays import interval, march, origin_of, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add, uniform
 from edge_server.fields.common.kernels.volume_rendering import (
-    OPAQUE_DEPTH,
     activate_color,
     activate_density,
     add_harmonics,
     add_harmonics_backward,
     ray_loss,
 )
+from edge_server.fields.common.tuned_numbers import ASKED_DEPTH, OPAQUE_DEPTH
 
 CHUNK = 2048  # samples a chunk has room for; its activations stay in the second-level cache
 ROW = CHUNK + PADDING  # of which CHUNK are used
@@ -38,11 +38,6 @@ DRAWN = 32  # rays drawn at a time
 # high, and an unfinished ray is lost. Where densities are eight times too high, that loses next to no rays;
 # rounds of a quarter would lose one in six.
 FRESH, LEAST = CHUNK - CHUNK // 8, 32
-
-# A ray is followed until the grid's densities make this optical depth, then the field is asked whether it is
-# opaque. Less than OPAQUE_DEPTH, so that few samples behind a surface are evaluated; but each query costs a
-# round.
-ASKED = 5.0
 
 _F0, _F1, _BYTE = np.float32(0.0), np.float32(1.0), np.float32(1.0 / 255.0)
 
@@ -212,7 +207,7 @@ def _march_chunk(encoding, views, ray_sampling, space, net, chunk, worker, x, li
             r = active[marched]
             o, d = origin_of(views, np.int64(ray[r, 9])), (ray[r, 0], ray[r, 1], ray[r, 2])
             at, leave = travel[r, AT], travel[r, LEAVE]
-            end, travel[r, AT], _ = march(space, o, d, at, leave, x, ts, dts, end, room, np.float32(ASKED))
+            end, travel[r, AT], _ = march(space, o, d, at, leave, x, ts, dts, end, room, np.float32(ASKED_DEPTH))
             stops[marched] = end
             marched += 1
         query_density(encoding, ray_sampling.levels, net, x, n, end, acts)

@@ -12,13 +12,12 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.simd import exp32, is_finite
-from edge_server.fields.common.settings import GUIDE_REACH
+from edge_server.fields.common.tuned_numbers import GUIDE_REACH, OPAQUE_DEPTH
 
 # Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
 # step opaque many times over, the smallest makes a whole ray transparent.
 RAW_LOW, RAW_HIGH = -12.0, 9.0
 SH_C1 = 0.4886025  # sqrt(3 / 4 pi), of spherical harmonics of degree 1
-OPAQUE_DEPTH = 9.2103404  # optical depth at which a ray ends: a transmittance of 1e-4
 
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
 

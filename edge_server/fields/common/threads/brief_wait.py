@@ -11,10 +11,7 @@ from numba.extending import intrinsic
 
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add_at
-
-# Looks of a wait, each followed by a pause of the core, of 30 to 140 cycles: 20 to 90 us; without a pause (not x86) a
-# few. Within a training step the next kernel comes within 50 us; to be woken takes 30 to 70 us on two shared cores.
-LOOKS = 2000
+from edge_server.fields.common.tuned_numbers import WAIT_LOOKS
 
 _X86 = platform.machine() in ("x86_64", "AMD64")
 
@@ -45,8 +42,8 @@ def _first(typingctx: Any, array: Any) -> Any:
 
 @kernel
 def await_workers(done, workers):
-    """Wait until ``done[0]``, which each worker counts up, is ``workers`` or more; give up after ``LOOKS``."""
-    for _ in range(LOOKS):
+    """Wait until ``done[0]``, which each worker counts up, is ``workers`` or more; give up after ``WAIT_LOOKS``."""
+    for _ in range(WAIT_LOOKS):
         if _first(done) >= workers:
             return
         _pause()
@@ -61,9 +58,9 @@ def await_next_job(done, drawn):
     """
     fetch_add_at(done, 0, 1)
     looks = 0
-    while looks < LOOKS and _first(drawn) != 0:
+    while looks < WAIT_LOOKS and _first(drawn) != 0:
         looks += 1
         _pause()
-    while looks < LOOKS and _first(drawn) == 0:
+    while looks < WAIT_LOOKS and _first(drawn) == 0:
         looks += 1
         _pause()

@@ -29,16 +29,12 @@ import numpy as np
 
 from edge_server.fields.common.kernels.simd import COUNTER
 from edge_server.fields.common.threads.brief_wait import await_next_job, await_workers
+from edge_server.fields.common.tuned_numbers import MOST_WORKERS
 
 log = logging.getLogger(__name__)
 
 # Environment variable: threads of a pool, for users who run several processes side by side.
 THREADS_VARIABLE = "FRESHFIELD_THREADS"
-
-# More workers gain nothing, or lose: each takes the GIL once a job (docs/results/gpu/threads.json).
-MOST_USEFUL = 8
-
-SERVER_NICE = 5  # of workers in a server that answers cameras meanwhile
 
 
 def cores() -> int:
@@ -53,8 +49,8 @@ def cores() -> int:
 
 
 def default_threads() -> int:
-    """Number of workers by default: ``cores``, at most ``MOST_USEFUL`` unless the environment names it."""
-    return cores() if os.environ.get(THREADS_VARIABLE) else min(cores(), MOST_USEFUL)
+    """Number of workers by default: ``cores``, at most ``MOST_WORKERS`` unless the environment names it."""
+    return cores() if os.environ.get(THREADS_VARIABLE) else min(cores(), MOST_WORKERS)
 
 
 class _Job:

@@ -71,7 +71,7 @@ def unturned(before: View, now: View) -> bool:
         return False
     shift = now.camera_to_world[:3, :3].T @ (now.camera_to_world - before.camera_to_world)[:3, 3]
     first, second = (cv2.cvtColor(np.ascontiguousarray(v.image[..., :3]), cv2.COLOR_RGB2GRAY) for v in (before, now))
-    corners = cv2.goodFeaturesToTrack(first, tuned.CORNERS, 0.01, tuned.CORNERS_APART_PX)
+    corners = cv2.goodFeaturesToTrack(first, tuned.CORNERS, tuned.CORNER_QUALITY, tuned.CORNERS_APART_PX)
     if corners is None or second.std() < 255.0 * tuned.BARE:
         return False
     found, known, _ = cv2.calcOpticalFlowPyrLK(first, second, corners, np.zeros_like(corners))

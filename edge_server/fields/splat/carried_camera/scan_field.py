@@ -32,7 +32,7 @@ from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE, SH_COLUMNS
 from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_tiles
-from edge_server.fields.splat.settings import PRUNE_OPACITY
+from edge_server.fields.splat.tuned_numbers import PRUNE_OPACITY
 from freshfield.geometry import Pinhole
 
 T = TypeVar("T")

@@ -103,6 +103,7 @@ LEAPT = 2  # further keyframes that fit where a leap of reported poses leads, fr
 ASTRAY_FOR = 4  # keyframes from which on it is said why reported poses do not fit
 SAME_TURN, TURNED = 1e-6, 0.05  # of matrices' numbers: a tracker's noise is more; a camera that turns
 CORNERS, LEAST_CORNERS, CORNERS_APART_PX = 200, 8, 3  # of a picture, followed to the next keyframe
+CORNER_QUALITY = 0.01  # of one, least share of the best corner's
 # Median by which they move elsewhere than reported, pixels and share of the way. Keyframes of `redkitchen`, .3 s apart,
 # have a share of more than .2 in one of ten pairs once their turns are taken out, in three of four as they are.
 BESIDE_PX, BESIDE_SHARE = 1.0, 0.25

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.camera import SIZE, load_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw, is_finite, log32
-from edge_server.fields.common.settings import BETA1, BETA2
+from edge_server.fields.common.tuned_numbers import BETA1, BETA2
 from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, POSITION, QUATERNION, RADIUS, SCALE
 from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,
@@ -25,12 +25,13 @@ from edge_server.fields.splat.kernels.project_backward import (
     load_block,
     project_backward,
 )
-from edge_server.fields.splat.settings import (
+from edge_server.fields.splat.tuned_numbers import (
     ASPECT,
     COLOR_HIGH,
     COLOR_LOW,
     GRADIENT_LIMIT,
     LARGEST,
+    LOG_SCALE_LEAST,
     POSITION_LIMIT,
     RATE_SETTLED,
     RAW_OPACITY_LIMIT,
@@ -106,7 +107,7 @@ def clamp_gaussian(params, i):
         row[SCALE + k] = min(row[SCALE + k], top)
     low = max(row[SCALE], max(row[SCALE + 1], row[SCALE + 2])) - _LOG_ASPECT
     for k in range(3):
-        row[SCALE + k] = max(row[SCALE + k], max(low, np.float32(-11.0)))
+        row[SCALE + k] = max(row[SCALE + k], max(low, np.float32(LOG_SCALE_LEAST)))
     square = _F0
     for k in range(4):
         square += row[QUATERNION + k] * row[QUATERNION + k]

@@ -16,7 +16,7 @@ from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, SIZE, l
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw, exp32, is_finite, log32
 from edge_server.fields.common.kernels.volume_rendering import harmonic
-from edge_server.fields.splat.settings import ALPHA_MIN, LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
+from edge_server.fields.splat.tuned_numbers import ALPHA_MIN, LOG_SCALE_HIGH, LOG_SCALE_LOW, LOW_PASS, RAW_OPACITY_LIMIT
 
 # Columns of a Gaussian's parameters; from BASE on the SH_COLUMNS of the spherical harmonics of degree 1,
 # three for each.
@@ -38,7 +38,6 @@ BLOCK = 128  # Gaussians a task
 DEPTH_BITS = 20
 _NEAREST_BITS, _DROPPED_BITS = (np.int32(0x3C23D70A), np.int32(9))  # the bits of .01; lower bits that are left out
 
-LOW_PASS = 0.3  # pixels squared, added to projected variances: nothing is sharper than a pixel
 FAR = 1e5  # scene units: beyond it float32 squares lose their meaning
 _NO_DIRECTION = 1e-20  # squared length below which a quaternion has no direction
 

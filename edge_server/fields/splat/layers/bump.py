@@ -47,7 +47,7 @@ def degrees_of(turn: Array) -> float:
 
 def _gray(picture: NDArray, lens: Pinhole) -> NDArray[np.float32]:
     small = cv2.resize(picture.astype(np.float32), (lens.width, lens.height), interpolation=cv2.INTER_AREA)
-    return np.asarray(cv2.GaussianBlur(small.mean(axis=2), (0, 0), 1.0), np.float32)
+    return np.asarray(cv2.GaussianBlur(small.mean(axis=2), (0, 0), tuned.BUMP_BLUR_PX), np.float32)
 
 
 def _align(

@@ -81,7 +81,7 @@ class Motion:
         self.anchors: NDArray[np.float64] | None = None
         self._knots = np.zeros((WINDOW, 0, 3))  # displacements
         self._first = 0  # number of the first knot: its instant times KNOTS_PER_S
-        self._reach = 0.3  # typical distance from an anchor to the next
+        self._reach = tuned.FIRST_REACH  # typical distance from an anchor to the next
         self._laplacian = np.zeros((0, 0))  # (K, K), of the graph of neighbors
         self._band = np.zeros((0, BAND, 0, 0), np.float32)  # memory of ``solve``, see ``kernels.solve``
         self._spans: list[_Span] = []
@@ -172,7 +172,9 @@ class Motion:
         count = len(self.anchors)
         d2 = _square_distances(self.anchors, self.anchors)
         np.fill_diagonal(d2, np.inf)
-        self._reach = max(float(np.sqrt(np.median(d2.min(axis=1)))), tuned.LEAST_REACH) if count > 1 else 0.3
+        self._reach = tuned.FIRST_REACH
+        if count > 1:
+            self._reach = max(float(np.sqrt(np.median(d2.min(axis=1)))), tuned.LEAST_REACH)
         near = np.argsort(d2, axis=1, kind="stable")[:, : min(tuned.NEIGHBORS, count - 1)]
         joined = np.zeros((count, count), np.bool_)
         np.put_along_axis(joined, near, True, axis=1)
@@ -271,7 +273,7 @@ def _cluster(
     d2 = np.full(len(points), np.inf)
     for _ in range(count - 1):
         d2 = np.minimum(d2, ((points - centers[-1]) ** 2).sum(axis=1))
-        centers.append(points[np.argmax(d2 * np.minimum(opacity, 0.5))])
+        centers.append(points[np.argmax(d2 * np.minimum(opacity, tuned.CLUSTER_OPACITY))])
     found = np.array(centers)
     for _ in range(tuned.CLUSTER_ROUNDS):
         nearest = _square_distances(points, found).argmin(axis=1)

@@ -56,7 +56,7 @@ class MovingSet:
     @property
     def capacity(self) -> int:
         """Largest number of Gaussians."""
-        return round(tuned.GAUSSIANS * (1.0 + (self.capacity_factor - 1.0) / 3.0))
+        return round(tuned.GAUSSIANS * (1.0 + (self.capacity_factor - 1.0) / tuned.GAUSSIANS_SLOWER))
 
     def follow_foreground(self, share: float) -> None:
         """Let the capacity follow the foreground's share of the pixels: up at once, down slowly."""

@@ -20,6 +20,7 @@ from edge_server.fields import Budget, Rendering, View
 from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.threads.thread_pool import lower_priority
 from edge_server.fields.common.training_schedule import StepBudget
+from edge_server.fields.common.tuned_numbers import LOSS_STEPS
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers import tuned_numbers as tuned
@@ -153,7 +154,7 @@ class StaticLayer:
             losses.append(loss)
             rays, samples = rays + seen, samples + pairs
             pace.end_step()
-        return float(np.mean(losses[-32:])) if losses else 0.0, rays, samples
+        return float(np.mean(losses[-LOSS_STEPS:])) if losses else 0.0, rays, samples
 
     def _finish_round_step(self) -> None:
         self._round_step += 1

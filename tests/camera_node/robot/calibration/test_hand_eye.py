@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 from camera_node.cli import main
 from camera_node.robot.arm.camera_poses import base_matrix, camera_poses
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, read_hand_eye
-from camera_node.robot.calibration import CalibrationError, guided
-from camera_node.robot.calibration.guided import HandEyeSession, missing_turn
+from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.hand_eye import guided_session
 from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, solve
+from camera_node.robot.calibration.hand_eye.guided_session import HandEyeSession, missing_turn
 from camera_node.robot.calibration.hand_eye.refinement import refine
 from camera_node.robot.calibration.hand_eye.samples import Samples, angle_deg, distance_mm, diversity
 from camera_node.robot.calibration.inputs import read_visp_folder
@@ -368,7 +369,7 @@ def test_a_source_that_never_repeats_follows_the_time_of_day_as_in_a_node(monkey
     asked, endless = [], Recording(taken()[1])
     endless.contents = None
     monkeypatch.setattr(endless, "content", lambda tick: asked.append(tick) or 0)
-    next(guided._shots(endless, "png", None))
+    next(guided_session._shots(endless, "png", None))
     assert asked[0] / 500 == pytest.approx(time.time(), abs=60)
 
 
@@ -382,7 +383,7 @@ def test_what_it_saves_is_what_the_node_takes_it_for(tmp_path, monkeypatch, caps
     config = source_config(plan).arm
     base = base_matrix(config)
     recording = Recording(base @ se3_inverse(taken()[1]))
-    monkeypatch.setattr(guided, "open_sources", lambda *_: {"eye": recording})
+    monkeypatch.setattr(guided_session, "open_sources", lambda *_: {"eye": recording})
     words = ["--live", str(file), "--camera", "eye", "--board", BOARD, "--out", str(out), "--eye-to-hand", "--json"]
     assert main(["calibrate", "hand-eye", *words]) == 0
     said = capsys.readouterr()

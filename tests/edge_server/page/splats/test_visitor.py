@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from channel_emu.live.tcp_proxy import PIECE_BYTES, TIMEOUT_S
+from channel_emu.live.tuned_numbers import PIECE_BYTES, RESEND_AFTER_S
 from edge_server.page.splats import messages
 from edge_server.page.splats import tuned_numbers as tuned
 from edge_server.page.splats.published import Published, Publisher
@@ -46,7 +46,7 @@ class Scattering:
         for _ in range(-(-size // PIECE_BYTES)):
             times = self.rng.geometric(1.0 - self.loss)
             self.free_s = max(self.free_s, now_s) + self.rng.exponential(self.mean_s, times).sum()
-            self.last_s = max(self.last_s, self.free_s + TIMEOUT_S * (times - 1))
+            self.last_s = max(self.last_s, self.free_s + RESEND_AFTER_S * (times - 1))
         return self.last_s
 
 

@@ -108,7 +108,7 @@ def align(relative: Image, inverse: Image) -> tuple[Image, float]:
     spread_px = tuned.NETWORK_SPREAD * max(inverse.shape)
     even = cv2.GaussianBlur(error, (0, 0), spread_px) / (cv2.GaussianBlur(right, (0, 0), spread_px) + 1e-2)
     metric = np.nan_to_num(scale * relative + shift) * np.exp(even)
-    low, high = np.percentile(q, [1.0, 99.0])
+    low, high = np.percentile(q, tuned.NETWORK_KNOWN)
     believed = (metric > low / tuned.NETWORK_BEYOND) & (metric < high * tuned.NETWORK_BEYOND)
     return np.where(believed, metric, 0.0).astype(np.float32), float(agree.mean())
 

@@ -75,7 +75,7 @@ class _Camera(NamedTuple):
         stride = max(1, round(np.sqrt(depth.size / tuned.REGISTERED_POINTS)))
         rows, columns = (stride * k for k in np.nonzero(depth[::stride, ::stride]))
         gray = cv2.cvtColor(np.clip(surface.color / np.float32(255.0), 0, 1).astype(np.float32), cv2.COLOR_RGB2GRAY)
-        gray = cv2.GaussianBlur(gray, (0, 0), 0.8)
+        gray = cv2.GaussianBlur(gray, (0, 0), tuned.GRAY_BLUR_PX)
         right, down = (cv2.Sobel(gray, cv2.CV_32F, x, 1 - x, scale=0.125) for x in (1, 0))
         points, normals = surface.rays() * depth[..., None], surface.normals() @ surface.pose[:3, :3]
         images = (np.asarray(image, np.float32) for image in (gray, right, down))
@@ -130,7 +130,7 @@ def register(
     before = _cost(cameras, poses, scales, by_stereo)
     for k in range(tuned.REGISTRATION_ROUNDS):
         # Most cameras are as calibrated, but one that was bumped is far off: its prior is a Cauchy distribution's.
-        prior = 1.0 / (deviation**2 * (1.0 + (total / (3.0 * deviation)) ** 2))
+        prior = 1.0 / (deviation**2 * (1.0 + (total / (tuned.PRIOR_DEVIATIONS * deviation)) ** 2))
         h, g = np.diag(prior), -total * prior
         near_m = tuned.NEAR_M * (tuned.NEAR_AT_FIRST if 2 * k < tuned.REGISTRATION_ROUNDS else 1.0)
         for i, j in _pairs(count):
@@ -142,8 +142,8 @@ def register(
             turn, shift, grow = np.split(step[7 * i : 7 * i + 7], [3, 6])
             poses[i][:3, :3] = so3_exp(turn) @ poses[i][:3, :3]
             poses[i][:3, 3] += shift
-            scales[i] *= np.exp(np.clip(grow[0], -0.3, 0.3))
-        if np.abs(step / deviation).max() < 0.01:
+            scales[i] *= np.exp(np.clip(grow[0], -tuned.LARGEST_LOG_SCALE, tuned.LARGEST_LOG_SCALE))
+        if np.abs(step / deviation).max() < tuned.SETTLED:
             break
     if not _cost(cameras, poses, scales, by_stereo) < before - (_least_gain(surfaces) if by_stereo else 0.0):
         poses, scales = [s.pose for s in surfaces], np.ones(count)
@@ -200,7 +200,7 @@ def _compare(
     error = ((points - poses[j][:3, 3] - to_j) * normal).sum(axis=1)
     facing = -(normal * to_j).sum(axis=1) / np.maximum(np.linalg.norm(to_j, axis=1), 1e-9)
     alike = (normal * (ours.normals[ours.rows, ours.columns] @ turn_i.T)).sum(axis=1)
-    use = inside & (theirs.depth[y, x] > 0) & (np.abs(error) < 4.0 * near_m)
+    use = inside & (theirs.depth[y, x] > 0) & (np.abs(error) < tuned.NEAR_MOST * near_m)
     use &= (alike > tuned.LEAST_ALIKE) & (facing > tuned.REGISTERED_FACING)
     if np.count_nonzero(use) < tuned.OVERLAP_LEAST:
         return []

@@ -33,7 +33,7 @@ from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIP, STR
 from edge_server.fields.splat.kernels.project import CONIC_A, CONIC_B, CONIC_C, MEAN_X, MEAN_Y, RED, TILE
 from edge_server.fields.splat.kernels.rasterize import begin_tile, composite_strips, strip_scratch
 from edge_server.fields.splat.layers.tuned_numbers import ATTACHED, NOISE, ROBUST
-from edge_server.fields.splat.settings import ALPHA_MAX, ALPHA_MIN
+from edge_server.fields.splat.tuned_numbers import ALPHA_MAX, ALPHA_MIN
 
 _COLUMN = 3 * PIXELS  # floats: red, green and blue of a tile
 _ANCHOR = 2 * _COLUMN

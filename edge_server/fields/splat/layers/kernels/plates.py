@@ -222,6 +222,7 @@ def vote(
     height, width = difference.shape
     decay, learning = np.float32(1.0 - 1.0 / tuned.MEMORY), np.float32(tuned.DEVIATION_RATE)
     least, near = np.float32(tuned.LEAST_WEIGHT), np.float32(tuned.THRESHOLD)
+    most = np.float32(tuned.DEVIATION_MOST)
     rates, votes, joins_another = np.empty(width, np.float32), np.empty(width, np.bool_), np.empty(width, np.bool_)
     by = np.empty(3 * width, np.float32)
     for y in range(height):
@@ -230,7 +231,7 @@ def vote(
         for x in range(width):
             d, old = difference[y, x], deviation[x]
             limit = max(near, np.float32(tuned.DEVIATIONS) * old)
-            shows = (not fixed[x]) & (foreground[y, x] == 0) & known[x] & (d < np.float32(3.0) * limit)
+            shows = (not fixed[x]) & (foreground[y, x] == 0) & known[x] & (d < most * limit)
             deviation[x] = old + (d - old) * learning if shows else old
         for x in range(width):
             total[x] = total[x] if fixed[x] else total[x] * decay + _F1

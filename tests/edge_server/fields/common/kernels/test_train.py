@@ -15,6 +15,7 @@ from edge_server.fields.common.kernels import volume_rendering as volume
 from edge_server.fields.common.kernels.train import RaySampling, train_chunks
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.training_schedule import step_length
+from edge_server.fields.common.tuned_numbers import GUIDE_REACH
 from edge_server.fields.ngp.field import NgpField
 from tests.edge_server.fields.small import KERNEL_SETTINGS as SETTINGS
 from tests.edge_server.fields.small import KERNEL_VIEWS as VIEWS
@@ -142,7 +143,7 @@ def test_weight_away_from_a_guide_costs_what_geman_and_mcclure_say(density: floa
     assert error == pytest.approx(expected.item(), rel=1e-4)  # the guide is no color
     through = torch.exp(-torch.cumsum(sigma * delta, 0))
     before = torch.cat([torch.ones(1, dtype=torch.float64), through[:-1]])
-    off = (t - guide) / (volume.GUIDE_REACH * guide)
+    off = (t - guide) / (GUIDE_REACH * guide)
     away = ((before - through) * off**2 / (1 + off**2)).sum() + through[-1]
     (loss.sum() + 0.7 * away).backward()
     assert params.grad is not None

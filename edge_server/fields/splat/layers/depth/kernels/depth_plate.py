@@ -127,7 +127,7 @@ def fit_planes(counter, worker, inverse, image, nearness, noise, plane, slope):
                     continue
                 # One pixel alone may be far off, but the median of few neighbors says little.
                 a, n = _local_median(inverse, y, x, near)
-                if n < 4 and abs(a - own) > np.float32(4.0) * noise:
+                if n < tuned.LONE and abs(a - own) > np.float32(tuned.LONE_NOISES) * noise:
                     a = own
                 b, c = _F0, _F0
                 for r in range(tuned.ROUNDS):
@@ -151,9 +151,10 @@ def fit_planes(counter, worker, inverse, image, nearness, noise, plane, slope):
                             t0 += w * q
                             t1 += w * dx * q
                             t2 += w * dy * q
-                    if s0 < np.float32(0.5):
+                    if s0 < np.float32(tuned.LEAST_WEIGHT):
                         break
-                    mx, my, over = s1 / s0, s2 / s0, np.float32(0.05) * s0  # of a window on one line, no slope across
+                    mx, my = s1 / s0, s2 / s0
+                    over = np.float32(tuned.LEVEL) * s0  # of a window on one line, no slope across
                     xx, xy, yy = s11 + over - s1 * mx, s12 - s1 * my, s22 + over - s2 * my
                     qx, qy = t1 - mx * t0, t2 - my * t0
                     det = xx * yy - xy * xy
@@ -190,8 +191,8 @@ def fill_holes(counter, worker, inverse, slope, image, filled, filled_slope):
                             continue
                         dx, dy = np.float32(x - i), np.float32(y - j)
                         far = _color_distance(image, y, x, j, i) / np.float32(3.0 * tuned.HOLE_COLOR)
-                        far += np.float32(0.25) * np.sqrt(dx * dx + dy * dy)
+                        far += np.float32(tuned.HOLE_NEAR) * np.sqrt(dx * dx + dy * dy)
                         value = inverse[j, i] + slope[j, i, 0] * dx + slope[j, i, 1] * dy
-                        if (far < least) & (value > np.float32(0.5) * inverse[j, i]):
+                        if (far < least) & (value > np.float32(tuned.HOLE_LEAST) * inverse[j, i]):
                             least, filled[y, x] = far, value
                             filled_slope[y, x, 0], filled_slope[y, x, 1] = slope[j, i, 0], slope[j, i, 1]

@@ -170,7 +170,7 @@ def shade_surfaces(counter, worker, meshes, targets, inverse, color, agreement):
                     mean, same = _F0, _F0
                     for k in range(count):
                         q = inverse[t, k, y, x]
-                        if (q > _F0) & (abs(q - front) < np.float32(1.5 * tuned.AGREE) * front):
+                        if (q > _F0) & (abs(q - front) < np.float32(tuned.SAME_SURFACE * tuned.AGREE) * front):
                             tried[k] = True
                             mean += q
                             same += _F1
@@ -186,7 +186,7 @@ def shade_surfaces(counter, worker, meshes, targets, inverse, color, agreement):
                             meshes, k, px + cam[ORIGIN], py + cam[ORIGIN + 1], pz + cam[ORIGIN + 2]
                         )
                         through += beyond
-                        if w < np.float32(0.01):
+                        if w < np.float32(tuned.LEAST_TRUST):
                             continue
                         far2, length = tx * tx + ty * ty + tz * tz, np.sqrt(nx * nx + ny * ny + nz * nz)
                         far = np.sqrt(far2)
@@ -204,5 +204,7 @@ def shade_surfaces(counter, worker, meshes, targets, inverse, color, agreement):
                     found = through <= np.float32(tuned.REJECT) * agree + np.float32(tuned.REJECT_LEAST)
                     if found or sure <= _F0:  # of surfaces that are seen through, the nearest
                         color[t, y, x, 0], color[t, y, x, 1], color[t, y, x, 2] = r / weights, g / weights, bl / weights
-                        sure = min(np.float32(2.0) * agree, _F1) if found else np.float32(0.3) * min(agree, _F1)
+                        sure = np.float32(tuned.SEEN_THROUGH) * min(agree, _F1)
+                        if found:
+                            sure = min(np.float32(tuned.ENOUGH) * agree, _F1)
                 agreement[t, y, x] = sure

@@ -15,6 +15,7 @@ import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from freshfield.transport import Transport
+from freshfield_up import tuned_numbers as tuned
 
 LOOPBACK = "127.0.0.1"
 
@@ -43,7 +44,7 @@ def is_free(port: int) -> bool:
         return True
 
 
-def is_serving(address: str, timeout_s: float = 0.5, transport: Transport | None = None) -> bool:
+def is_serving(address: str, timeout_s: float = tuned.ANSWER_S, transport: Transport | None = None) -> bool:
     """Whether the gRPC health service at ``host:port`` says SERVING."""
     with (transport or Transport()).channel(address) as channel:
         try:
@@ -58,7 +59,7 @@ def accepts(address: str) -> bool:
     """Whether a server accepts connections at ``host:port``."""
     host, _, port = address.rpartition(":")
     try:
-        socket.create_connection((host, int(port)), timeout=0.5).close()
+        socket.create_connection((host, int(port)), timeout=tuned.ANSWER_S).close()
     except OSError:
         return False
     return True
@@ -68,7 +69,7 @@ def page_answers(port: int) -> bool:
     """Whether the page on the loopback port answers with a document."""
     direct = urllib.request.build_opener(urllib.request.ProxyHandler({}))
     try:
-        with direct.open(f"http://{LOOPBACK}:{port}/", timeout=1.0) as answer:
+        with direct.open(f"http://{LOOPBACK}:{port}/", timeout=tuned.PAGE_ANSWER_S) as answer:
             return bool(answer.status == 200)
     except (OSError, http.client.HTTPException):
         return False

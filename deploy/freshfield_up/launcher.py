@@ -15,10 +15,11 @@ from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
+from freshfield import scenario as scenarios
 from freshfield.files import read_status
 from freshfield.machine_load import LoadMeter
-from freshfield.scenario import Scenario
-from freshfield_up import console, folder, net
+from freshfield.scenario import Scenario, ScenarioError
+from freshfield_up import console, folder, ports
 from freshfield_up import tuned_numbers as tuned
 from freshfield_up.commands import Options, ProcessSet, process_set, program
 from freshfield_up.processes import Child, kill, stop
@@ -151,13 +152,13 @@ class Launcher:
         """One step of the start: the node once its arm answers, the emulator once the edge serves, and the
         page's address once the page answers."""
         emulator = self.processes.emulator
-        if self.processes.node.process is None and net.accepts(self.processes.arm_address):
+        if self.processes.node.process is None and ports.accepts(self.processes.arm_address):
             self.processes.node.start()
-        if emulator.process is None and net.is_serving(self.processes.edge_address):
+        if emulator.process is None and ports.is_serving(self.processes.edge_address):
             emulator.start()
-        if not self._page_announced and net.page_answers(self.options.port):
+        if not self._page_announced and ports.page_answers(self.options.port):
             self._page_announced = True
-            here, port, after_s = net.LOOPBACK, self.options.port, now_s - self._began_s
+            here, port, after_s = ports.LOOPBACK, self.options.port, now_s - self._began_s
             self._say(f"page: http://{here}:{port}   (after {after_s:.0f} s)")
             self._say(f"      from another machine first: ssh -L {port}:{here}:{port} THIS-MACHINE")
         if not self._compiling_announced and self._edge_doing().startswith(_COMPILING):
@@ -178,7 +179,7 @@ class Launcher:
         """The process that is not ready yet, if any."""
         if self.processes.emulator.process is None or not self._page_announced:
             return self.processes.edge
-        if not net.is_serving(self.processes.emulator_address):
+        if not ports.is_serving(self.processes.emulator_address):
             return self.processes.emulator
         phases = [read_status(file).get("phase") for file in self.options.out.glob("node-*.json")]
         if "streaming" not in phases:
@@ -245,3 +246,16 @@ class Launcher:
             self._fail(report.exit_summary())
             return
         self._say(summarize(out))
+
+
+def open_launcher(scenario: str | Path, options: Options, say: Callable[[str], None] = print_line) -> Launcher:
+    """A launcher, checked and not started. scenario: file or name. say: see ``Launcher``. Raises ScenarioError."""
+    opened = scenarios.load(scenario, options.seed)
+    if not ports.is_free(options.port):
+        raise ScenarioError(f"port {options.port} is taken by another program; choose one with --port (PORT=)")
+    if options.data is not None and not options.data.is_dir():
+        raise ScenarioError(f"{options.data}: no such folder of recorded data (--data)")
+    kind, _, file = (options.policy or "").partition(":")
+    if kind == "bandit" and Path(file).expanduser().resolve().is_relative_to(options.out.resolve()):
+        raise ScenarioError(f"--policy {options.policy}: {options.out} is emptied first; choose another --out")
+    return Launcher(opened, options, say)
