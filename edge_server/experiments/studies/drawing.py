@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from edge_server.experiments.common.drawn_images import Image, draw_images
 from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
 from edge_server.experiments.common.statistics import interval
-from edge_server.experiments.studies.findings import NO_DELAY, USE_ALL
-from edge_server.experiments.studies.study import METRICS, StudyRequest
+from edge_server.experiments.studies.study import StudyRequest
 from edge_server.experiments.studies.trial import last_images, scenes_here, usual_trial
+from edge_server.experiments.studies.verdicts import METRICS, NO_DELAY, USE_ALL
 from edge_server.report.style import CYCLE, GRAY, figure, label_lines
 
 

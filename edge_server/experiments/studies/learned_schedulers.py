@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import product
 
 from edge_server.experiments.common.seed_table import Row
-from edge_server.experiments.studies.findings import better, better_than_all
 from edge_server.experiments.studies.learning import (
     FOUR_VIEWPOINTS,
     Cases,
@@ -16,7 +15,8 @@ from edge_server.experiments.studies.learning import (
     measure,
     room,
 )
-from edge_server.experiments.studies.study import Claim, Statistic, Study, StudyRequest
+from edge_server.experiments.studies.study import Study, StudyRequest
+from edge_server.experiments.studies.verdicts import Claim, Statistic, better, better_than_all
 from edge_server.scheduler.learned.settings import Action
 
 LEARNED, RANDOM, ALL = {"policy": "learned"}, {"policy": "random"}, {"policy": "all"}

@@ -12,8 +12,8 @@ from camera_node.synthetic import make_scene
 from edge_server.experiments.common.drawn_images import draw_images
 from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.tables import markdown_table
-from edge_server.experiments.studies.findings import better, better_than_all
-from edge_server.experiments.studies.study import Claim, Study, StudyRequest
+from edge_server.experiments.studies.study import Study, StudyRequest
+from edge_server.experiments.studies.verdicts import Claim, better, better_than_all
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.ssim import ssim

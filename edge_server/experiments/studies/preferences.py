@@ -13,9 +13,9 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.studies.drawing import draw_curve
-from edge_server.experiments.studies.findings import better, level
-from edge_server.experiments.studies.study import Claim, Study, StudyRequest, open_engine
+from edge_server.experiments.studies.study import Study, StudyRequest, open_engine
 from edge_server.experiments.studies.trial import scene_label, scenes_here
+from edge_server.experiments.studies.verdicts import Claim, better, level
 from edge_server.experiments.studies.viewpoints import (
     JUDGED,
     SCENES,

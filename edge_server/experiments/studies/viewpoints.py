@@ -14,9 +14,9 @@ from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.studies.drawing import draw_curve
-from edge_server.experiments.studies.findings import better, trend
-from edge_server.experiments.studies.study import METRICS, Claim, Study, StudyRequest, open_engine
+from edge_server.experiments.studies.study import Study, StudyRequest, open_engine
 from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here
+from edge_server.experiments.studies.verdicts import METRICS, Claim, better, trend
 from edge_server.experiments.viewpoints.stage import Stage, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer

@@ -20,14 +20,19 @@ from edge_server.experiments.studies.depth_rate import DepthRun, run_with_depth
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
-from edge_server.experiments.studies.study import Claim, Finding, Study, StudyError, StudyRequest, Verdict, judge
+from edge_server.experiments.studies.study import Study, StudyError, StudyRequest
 from edge_server.experiments.studies.study_command import checked, main
 from edge_server.experiments.studies.trial import Trial, run_trial
 from edge_server.experiments.studies.tuned_numbers import TRAININGS
+from edge_server.experiments.studies.verdicts import Claim, Finding, Verdict, judge
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.rewards import f_w
 from tests.edge_server.experiments.rollouts.small import RAW
 from tests.support import refused
+
+
+def judged(asked: Study, table: SeedTable) -> list[Verdict]:
+    return judge(asked.claims, asked.metrics, asked.panels, table)
 
 
 def request(tmp_path: Path, **more: Any) -> StudyRequest:
@@ -70,7 +75,7 @@ def verdicts(name: str, tmp_path: Path, rule: Callable[[Any], dict[str, Any]], s
     points = STUDIES[name].cases(request(tmp_path, seeds=seeds, scenes=("room",)))
     rows = [{**p.labels, "seed": p.trial.seed, **rule(p.trial)} for p in points]
     table = SeedTable([{**row, **f_w(row)} for row in rows])
-    return judge(STUDIES[name], table)
+    return judged(STUDIES[name], table)
 
 
 def answers(found: list[Verdict], *words: str) -> set[str]:
@@ -176,8 +181,8 @@ def test_verdicts_are_corrected_for_their_number():
     claim = Claim("is better.", lambda table, metric, of: Finding("", (Interval(*table.values(metric, **of)[0]),)))
     better = Study("s", "s", lambda _: [], lambda cases, _: [], ("reward",), (claim,), ("scene",))
     rows = [{"scene": k, "seed": 0, "reward": row} for k, row in enumerate([lucky, certain, *[equal] * 98])]
-    assert [v.verdict for v in judge(better, SeedTable(rows))] == ["undecided", "holds", *["undecided"] * 98]
-    assert [v.verdict for v in judge(better, SeedTable(rows[:2]))] == ["holds", "holds"]
+    assert [v.verdict for v in judged(better, SeedTable(rows))] == ["undecided", "holds", *["undecided"] * 98]
+    assert [v.verdict for v in judged(better, SeedTable(rows[:2]))] == ["holds", "holds"]
 
 
 def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
@@ -272,7 +277,7 @@ def test_claims_hold_if_and_only_if_what_was_learned_is_better(gain: float, said
         ("weights", by_reward, "it matters"),
         ("drift", {"learned before": 3.0, "learned afterwards": 3.0 + 0.5 * gain}, "on the new channel"),
     ):
-        found = judge(STUDIES[name], table_of({**fixed, **levels}, judged_by="moving"))
+        found = judged(STUDIES[name], table_of({**fixed, **levels}, judged_by="moving"))
         assert answers(found, claim) == {said}, name
 
 

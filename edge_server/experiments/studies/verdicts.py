@@ -1,28 +1,137 @@
-"""Statistics of claims: curves with an optimum, plateaus, trends, and differences of two policies.
+"""Claims of studies, and the verdicts on them.
 
-Each function makes a ``Statistic`` from the names of labels; differences are positive where the first is better.
+Statistics that claims are made of: curves with an optimum, plateaus, trends, and differences of two policies.
+
+Each of the functions up to ``judge`` makes a ``Statistic`` from the names of labels; differences are positive where the
+first is better.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 from edge_server.experiments.common.seed_table import TRAINING, Curve, PerSeed, Row, SeedTable, difference
 from edge_server.experiments.common.statistics import (
     Interval,
+    all_of,
     at_its_best,
     crossed,
+    discoveries,
     interval,
     move_of_optimum,
     optimum,
     paired,
 )
 from edge_server.experiments.common.tables import number
-from edge_server.experiments.studies.study import METRICS, Finding, Statistic
+from edge_server.experiments.studies.tuned_numbers import LEAST_DB
+from edge_server.scheduler.learned.tuned_numbers import W_S
 
 NO_DELAY, USE_ALL = "no delay", "all"
+HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"
+
+
+class Metric(NamedTuple):
+    """A measured quantity.
+
+    label: text of the axis. lower: whether lower is better. digits: decimals in texts.
+    least: smallest difference that supports a claim.
+    """
+
+    label: str
+    lower: bool
+    digits: int
+    least: float
+
+
+METRICS = {
+    "psnr_db": Metric("PSNR (dB)", False, 2, LEAST_DB),
+    "psnr_moving_db": Metric("PSNR, moving pixels (dB)", False, 2, LEAST_DB),
+    "shown_psnr_db": Metric("PSNR as shown (dB)", False, 2, LEAST_DB),
+    "shown_psnr_moving_db": Metric("PSNR as shown, moving pixels (dB)", False, 2, LEAST_DB),
+    "ssim": Metric("SSIM", False, 3, 0.002),
+    "lpips": Metric("LPIPS", True, 3, 0.002),
+    "aaoi_ms": Metric("mean age of used views (ms)", True, 1, 0.0),
+    "f_w": Metric("F_w (6.37)", True, 3, 0.01),
+    "f_w_corrected": Metric(f"F_w with w_s = {-W_S:g}", True, 3, 0.01),
+    "kilobytes_per_s": Metric("kilobytes a second, all cameras", True, 0, 0.0),
+    "reward": Metric("reward", False, 4, 0.0),
+    "path_m": Metric("path (m)", True, 2, 0.0),
+    "does_not_know": Metric("share of cases", False, 2, 0.0),
+    "agreement_share": Metric("share of the expert's agreement with itself", False, 3, 0.0),
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found for a claim.
+
+    text: in words.
+    differences: what must lie above the claim's bound, each of them.
+    """
+
+    text: str
+    differences: tuple[Interval, ...]
+
+    def above(self, bound: float) -> bool | None:
+        """Whether the differences lie above the bound, by their 95 % intervals; None where that is undecided."""
+        return all_of(d.above(bound) for d in self.differences)
+
+    def p_value(self, bound: float) -> float:
+        """The p-value of ``above``: the largest of all; where some contradict it, the smallest of theirs, times the
+        number of all."""
+        values = [d.p_value(bound) for d in self.differences if d.above(bound) is False]
+        if not values:
+            return max(d.p_value(bound) for d in self.differences)
+        return min(1.0, len(self.differences) * min(values))
+
+
+Statistic = Callable[[SeedTable, str, Row], Finding | None]
+"""(rows, metric, labels of the verdict) -> what was found; None where nothing was measured."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A sentence that holds where a statistic lies above a bound.
+
+    bound: None: the metric's least difference. By metric, or one for all.
+    where: further labels of the rows that it is about; also named in the verdict.
+    metrics: those that it is about; None: the study's.
+    """
+
+    text: str
+    statistic: Statistic
+    bound: float | Mapping[str, float] | None = 0.0
+    where: Row = field(default_factory=dict)
+    metrics: tuple[str, ...] | None = None
+
+    def bound_of(self, metric: str) -> float:
+        if self.bound is None:
+            return METRICS[metric].least
+        return self.bound if isinstance(self.bound, float | int) else self.bound[metric]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim, the result here, and whether the claim holds.
+
+    about: scene and setting.
+    holds: None where it is undecided.
+    """
+
+    about: str
+    claim: str
+    found: str
+    holds: bool | None
+
+    @property
+    def verdict(self) -> str:
+        return UNDECIDED if self.holds is None else HOLDS if self.holds else DOES_NOT_HOLD
+
+    def line(self) -> str:
+        return f"[{self.verdict}] {self.about}: {self.claim} Found: {self.found}"
 
 
 def interior(x: str) -> Statistic:
@@ -177,6 +286,34 @@ def level(mine: Row) -> Statistic:
         return Finding(f"{mean.text(METRICS[metric].digits)} over {mean.count} seeds.", (mean,)) if mean.count else None
 
     return found
+
+
+def judge(claims: Sequence[Claim], metrics: Sequence[str], panels: Sequence[str], table: SeedTable) -> list[Verdict]:
+    """The verdicts on all claims of a study, corrected for their number: of those that are decided, an expected share
+    of ``FALSE_DISCOVERY_RATE`` is wrong (Benjamini-Hochberg); the others are undecided.
+
+    metrics, panels: of the study, see ``Study``. table: its rows.
+    """
+    found: list[tuple[str, Claim, Finding, float]] = []
+    for values in table.distinct(*panels):
+        panel = dict(zip(panels, values))
+        for claim in claims:
+            labels = {**panel, **claim.where}
+            if any(panel.get(k, v) != v for k, v in claim.where.items()):
+                continue
+            for metric in claim.metrics or metrics:
+                finding = claim.statistic(table, metric, labels)
+                if finding is not None and finding.differences:
+                    about = ", ".join([*map(str, dict.fromkeys(labels.values())), METRICS[metric].label])
+                    found.append((about, claim, finding, claim.bound_of(metric)))
+    p_values = [finding.p_value(bound) for _, _, finding, bound in found]
+    tested = [p for p in p_values if p > 0.0]  # the others are without noise, and not a matter of chance
+    decided = iter(discoveries(tested))
+    kept = [p == 0.0 or next(decided) for p in p_values]
+    return [
+        Verdict(about, claim.text, finding.text, finding.above(bound) if sure else None)
+        for (about, claim, finding, bound), sure in zip(found, kept)
+    ]
 
 
 def _better_by(table: SeedTable, metric: str, labels: Row, mine: Row, other: Row) -> tuple[Interval, list[PerSeed]]:
