@@ -20,12 +20,6 @@ LONG_WORK_S = 10.0  # of a stage of a command that is announced in a pipe, too: 
 REDRAWN_S = 1.0  # between two drawings of a command's progress: the seconds that it tells change no faster
 
 # --- networks in ONNX (embed) ---
-# The file may come from anywhere. Twice the largest detectors of the family, 230 MB.
-MAX_MODEL_FILE_BYTES = 512 * 2**20
-MAX_TENSOR_ELEMENTS = 2**26  # largest tensor per image: six times the largest of YOLO11x at 640 pixels
-MAX_INPUT_PX = 2048
-# Three times the largest of the family, quantized. ONNX Runtime takes 1 s to load a chain of so many, 12 s of 30,000.
-MAX_GRAPH_NODES = 10_000
 # Images per run if the model takes any number: larger batches exceed the caches and take longer per image.
 EMBEDDING_BATCH = 4
 DEPTH_MOST_ASPECT = 2.5  # of the depth network's input: attention's memory grows with the square of the pixels

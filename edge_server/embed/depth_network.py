@@ -18,6 +18,7 @@ from edge_server import tuned_numbers as tuned
 from edge_server.embed import EmbeddingError
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
 from edge_server.embed.letterbox import checked
+from freshfield import limits
 
 MEAN, DEVIATION = np.array(
     [[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], np.float32
@@ -42,8 +43,9 @@ class DepthNetwork:
             raise EmbeddingError(f"{file}: expected a model of images (1, 3, height, width) of float32 or float16")
         self._input, self._type = inputs[0].name, INPUT_TYPES[inputs[0].type]
         self._fixed = [side if isinstance(side, int) else 0 for side in shape[2:]]
-        if max(self._fixed) > tuned.MAX_INPUT_PX:
-            raise EmbeddingError(f"{file}: images of {self._fixed} pixels are larger than {tuned.MAX_INPUT_PX} a side")
+        most = limits.MAX_MODEL_SIDE_PX
+        if max(self._fixed) > most:
+            raise EmbeddingError(f"{file}: images of {self._fixed} pixels are larger than {most} a side")
         self(np.zeros((PATCH, PATCH, 3), np.uint8))  # a model that cannot run, or gives something else, fails here
 
     def __call__(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:

@@ -17,6 +17,7 @@ from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import OUTPUT, Backbone, parse_model
 from edge_server.embed.letterbox import GRAY, blob, checked
 from edge_server.embed.projection import mean_and_axes
+from freshfield import limits
 from freshfield.limits import MAX_MODEL_BYTES
 from freshfield.untrusted import read_bytes
 
@@ -89,7 +90,7 @@ class Embedder:
 def open_model(file: Path) -> ort.InferenceSession:
     """Open the ONNX model in ``file``, which may come from anywhere. Raises EmbeddingError."""
     try:
-        data = read_bytes(file, tuned.MAX_MODEL_FILE_BYTES)
+        data = read_bytes(file, limits.MAX_MODEL_FILE_BYTES)
     except OSError as error:
         raise EmbeddingError(f"{file}: cannot be read: {error.strerror}; name a model in ONNX format") from None
     parse_model(data, file)

@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from edge_server.export import ExportError
 from edge_server.export.ply import write_table
-from edge_server.export.tuned_numbers import SPZ_BITS, SPZ_WHOLE_BITS
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.planar import unit_quaternions
 from edge_server.fields.splat.tuned_numbers import LOG_SCALE_HIGH, LOG_SCALE_LOW
 from freshfield.files import write_bytes
 
+SPZ_BITS = 12  # of a position behind the binary point, as others write it
+SPZ_WHOLE_BITS = 23  # of a position in all, without its sign
 Y0 = 0.28209479177387814
 # Signs of the harmonics of degree 1: Kerbl et al. negate those of odd order.
 SIGNS = np.array([-1, 1, -1], np.float32)

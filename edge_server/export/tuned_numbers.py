@@ -30,8 +30,3 @@ FRAMES_PER_S = 30
 """At which players show a sequence, unless told otherwise."""
 GAP_S = 5.0
 """Longer pauses between messages of a saved stream are left out."""
-
-SPZ_BITS = 12
-"""Of a position behind the binary point, as others write it."""
-SPZ_WHOLE_BITS = 23
-"""Of a position in all, without its sign."""

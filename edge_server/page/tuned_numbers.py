@@ -114,12 +114,10 @@ SCATTERED = 0.25
 AHEAD_OF_SPREAD, LEAST_AHEAD_M = 3.0, 1.0
 """Where optical axes do not meet, cameras look at a point so far ahead, in their mean distance from their middle."""
 
-# --- threads, connections and answers (page_thread, access_guard, preferences) ---
+# --- threads and connections (page_thread, access_guard) ---
 AFTER_ERROR_S = 1.0
 """Until a thread's next step, after one that failed."""
 THREAD_END_S = 5.0
 """For a thread to end, when the page does."""
 CLOSE_S = 2.0
 """For a visitor's browser to close a connection."""
-MAX_ANSWER_BYTES = 2**10
-"""Of an answer to a question about preferences: a hundred would do."""

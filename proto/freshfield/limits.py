@@ -81,6 +81,32 @@ MAX_MODEL_BYTES = 4 * 2**30
 """Memory for all ONNX models of a process together: four times the need of the largest YOLO11 for a batch. A
 larger allocation fails, whatever sizes the file states."""
 
+MAX_MODEL_FILE_BYTES = 512 * 2**20
+"""Size of an ONNX model's file: twice the largest detectors of the family, 230 MB."""
+
+MAX_GRAPH_NODES = 10_000
+"""Nodes of an ONNX model: three times the largest of the family, quantized. ONNX Runtime takes 1 s to load a chain of
+so many, 12 s of 30,000."""
+
+MAX_TENSOR_ELEMENTS = 2**26
+"""Largest tensor of an ONNX model per image: six times the largest of YOLO11x at 640 pixels."""
+
+MAX_MODEL_SIDE_PX = 2048
+"""Width and height of the images that an ONNX model takes."""
+
+MAX_HIDDEN, MAX_OMEGAS, MAX_FIRST_WEIGHTS = 1024, 4096, 2**22
+"""Width of a learned policy's layers, number of its waiting times, weights of its first layer. These bound what is
+allocated for a policy's file: with both networks and Adam's moments half a gigabyte, far more than a decision needs."""
+
+MAX_STATE_DIM = 4096
+"""Width of the embedding in a learned policy's state: the widest that can be configured."""
+
+MAX_LEARNER_BYTES = 2**29
+"""Unpacked size of a learned policy's file: both networks and Adam's moments at their largest."""
+
+MAX_ANSWER_BYTES = 2**10
+"""Body of an answer to the preference page: a hundred bytes would do."""
+
 # --- streams and cameras ----------------------------------------------------------------------
 
 MAX_CAMERAS = 1000

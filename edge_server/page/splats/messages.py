@@ -17,7 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.page.splats.records import RECORD, from_records
-from edge_server.page.splats.tuned_numbers import MOST_ANCHORS, VERSION
+
+VERSION = 1
+"""Of the messages. A reader refuses others."""
+MOST_ANCHORS = 255
+"""A byte names an anchor."""
 
 HEAD = struct.Struct("<Id")
 BLOCK = struct.Struct("<II")

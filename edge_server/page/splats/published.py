@@ -14,7 +14,7 @@ from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.page.splats import tuned_numbers as tuned
-from edge_server.page.splats.messages import KnotsBlock, MovingBlock, SceneBlock
+from edge_server.page.splats.messages import MOST_ANCHORS, KnotsBlock, MovingBlock, SceneBlock
 from edge_server.page.splats.records import scale_range, to_records, weights
 
 
@@ -124,7 +124,7 @@ class Publisher:
 
     def _moving(self, moving: MovingSnapshot) -> tuple[MovingBlock | None, KnotsBlock | None]:
         motion: Motion = moving.motion
-        if motion.anchors is None or not len(moving.params) or len(motion.anchors) > tuned.MOST_ANCHORS:
+        if motion.anchors is None or not len(moving.params) or len(motion.anchors) > MOST_ANCHORS:
             return None, None
         if motion.anchors is not self._anchors:
             self._anchors = motion.anchors

@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-VERSION = 1
-"""Of the messages. A reader refuses others."""
-
 CHUNK = 128
 """Static Gaussians sent together."""
-COLOR_LOW, COLOR_STEP = -0.5, 2.0 / 255
-"""Colors of Gaussians may leave [0, 1] by half (``fields.splat.settings``)."""
-MOST_ANCHORS = 255
-"""A byte names an anchor."""
 KNOTS_SENT = 6
 """Newest knots of the motion: the display needs four, those before serve a visitor whose messages come late."""
 

@@ -7,15 +7,6 @@ from __future__ import annotations
 W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
 SET_P, SET_S, SET_L = 0.02, 0.5, -1.0  # of (5.19), as 5.6.2 has them: PSNR per dB, SSIM, LPIPS
 
-# --- what a specification and a checkpoint may ask for (settings, state, actor) ---
-# A specification may come from an untrusted file. These bound what is allocated for it: with both networks
-# and Adam's moments half a gigabyte, far more than a decision needs.
-MAX_HIDDEN = 1024
-MAX_OMEGAS = 4096
-MAX_FIRST_WEIGHTS = 2**22
-MAX_DIM = 4096  # the widest configurable embedding (edge_server.embed)
-MAX_CHECKPOINT_BYTES = 2**29  # unpacked: both networks and Adam's moments at their largest
-
 # --- features of a state (state) ---
 # Features are clipped to this many standard deviations: what lies beyond is a broken value, not information.
 FEATURE_LIMIT = 8.0

@@ -8,8 +8,8 @@ import pytest
 
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.live.view_decoder import ViewDecoder
-from edge_server.tuned_numbers import MAX_GRAPH_NODES
 from freshfield.frame import Frame
+from freshfield.limits import MAX_GRAPH_NODES
 from tests.edge_server.frames import damaged_frame, frame
 from tests.support import refused
 

@@ -11,8 +11,8 @@ import pytest
 from edge_server.live import tuned_numbers as tuned
 from edge_server.page import PageError
 from edge_server.page.preferences import PreferencePage
-from edge_server.page.tuned_numbers import MAX_ANSWER_BYTES
 from edge_server.viewpoints.preference_session import PreferenceSession
+from freshfield.limits import MAX_ANSWER_BYTES
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.browser import Browser
 from tests.edge_server.page.visitor import ask
