@@ -46,7 +46,8 @@ export PYTHONPYCACHEPREFIX := $(abspath .venv)/byte-code
 unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
 WARM_UP = PYTHONPATH=proto:. $(PY) -m edge_server.fields.warm_up_command --field $(1)
-KERNELS := $(wildcard edge_server/fields/*/kernels/*.py edge_server/fields/*/*/kernels/*.py)
+# Kernels, and the numbers that they hold as constants.
+KERNELS := $(shell find edge_server/fields -path '*/kernels/*.py' -o -name settings.py -o -name tuned_numbers.py)
 # The line of pyproject.toml that starts with a name.
 wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
 TORCH := $(shell sed -n 's/^\(torch==[^ ]*\).*/\1/p' deploy/locks/torch-cuda.txt)

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from freshfield.machine_load import usable_cores
 from freshfield.scenario import Scenario
+from freshfield_up.child_process import Child
 from freshfield_up.ports import LOOPBACK, free_ports
-from freshfield_up.processes import Child
 
 # Variables that set the threads of numeric libraries, which start one for each core by default. Nodes and emulator get
 # only one: they gain nothing from more, which would compete with the edge's. The edge may use every core.

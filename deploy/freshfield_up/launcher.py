@@ -21,8 +21,8 @@ from freshfield.machine_load import LoadMeter
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield_up import console, folder, ports
 from freshfield_up import tuned_numbers as tuned
+from freshfield_up.child_process import Child, kill, stop
 from freshfield_up.commands import Options, ProcessSet, process_set, program
-from freshfield_up.processes import Child, kill, stop
 from freshfield_up.status import status_line, summarize
 
 _LOADING, _COMPILING = "loading", "compiling"
@@ -251,8 +251,7 @@ class Launcher:
 def open_launcher(scenario: str | Path, options: Options, say: Callable[[str], None] = print_line) -> Launcher:
     """A launcher, checked and not started. scenario: file or name. say: see ``Launcher``. Raises ScenarioError."""
     opened = scenarios.load(scenario, options.seed)
-    if not ports.is_free(options.port):
-        raise ScenarioError(f"port {options.port} is taken by another program; choose one with --port (PORT=)")
+    ports.check_free(options.port)
     if options.data is not None and not options.data.is_dir():
         raise ScenarioError(f"{options.data}: no such folder of recorded data (--data)")
     kind, _, file = (options.policy or "").partition(":")

@@ -14,6 +14,7 @@ os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
 import grpc
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from freshfield.scenario import ScenarioError
 from freshfield.transport import Transport
 from freshfield_up import tuned_numbers as tuned
 
@@ -33,15 +34,14 @@ def free_ports(count: int) -> list[int]:
             s.close()
 
 
-def is_free(port: int) -> bool:
-    """Whether nothing listens on the loopback port."""
+def check_free(port: int) -> None:
+    """Raises ScenarioError where something listens on the loopback port."""
     with socket.socket() as s:
         s.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as servers do: ignores TIME_WAIT
         try:
             s.bind((LOOPBACK, port))
         except OSError:
-            return False
-        return True
+            raise ScenarioError(f"port {port} is taken by another program; choose one with --port (PORT=)") from None
 
 
 def is_serving(address: str, timeout_s: float = tuned.ANSWER_S, transport: Transport | None = None) -> bool:

@@ -1,4 +1,4 @@
-"""Candidate viewpoints: discrete camera poses around a target (thesis 4.9), and how far apart they are."""
+"""Candidate viewpoints: discrete camera poses around a target (thesis 4.9)."""
 
 from __future__ import annotations
 
@@ -49,16 +49,6 @@ class Candidates:
         """(N, 3) unit vectors from the target to the cameras."""
         away = self.poses[:, :3, 3] - self.target
         return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-
-    def travel_m(self, start: int) -> Array:
-        """(N,) length of the way from candidate ``start`` to each one: round the target, not through it."""
-        away = self.poses[:, :3, 3] - self.target
-        far = np.linalg.norm(away, axis=1)
-        cosine = np.clip(self.directions @ self.directions[start], -1.0, 1.0)
-        arc = 0.5 * (far + far[start]) * np.arccos(cosine)
-        way = np.hypot(arc, far - far[start])
-        way[start] = 0.0  # the arc cosine of 1 - 1e-16 is 1e-8
-        return way
 
 
 def half_hemisphere(

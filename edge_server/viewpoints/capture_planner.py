@@ -125,7 +125,7 @@ def plan_capture(
     refused: list[int] = []
     free = candidates.reachable.copy()
     while len(stops) < state.views_wanted:
-        travel = candidates.travel_m(stops[-1].candidate) if stops else np.zeros(len(candidates))
+        travel = travel_m(candidates, stops[-1].candidate) if stops else np.zeros(len(candidates))
         left_m = np.inf if budget.path_m is None else budget.path_m - sum(s.travel_m for s in stops)
         state.open = free & (travel <= left_m)
         if not state.open.any():
@@ -151,6 +151,17 @@ def plan_capture(
         )
     note = _note(candidates, budget, stops, refused)
     return Plan(selector.name, tuple(stops), tuple(state.views), tuple(refused), note)
+
+
+def travel_m(candidates: Candidates, start: int) -> NDArray[np.float64]:
+    """(N,) length of the way from candidate ``start`` to each one: round the target, not through it."""
+    away = candidates.poses[:, :3, 3] - candidates.target
+    far = np.linalg.norm(away, axis=1)
+    cosine = np.clip(candidates.directions @ candidates.directions[start], -1.0, 1.0)
+    arc = 0.5 * (far + far[start]) * np.arccos(cosine)
+    way = np.hypot(arc, far - far[start])
+    way[start] = 0.0  # the arc cosine of 1 - 1e-16 is 1e-8
+    return way
 
 
 def _choose(state: CaptureState, selector: Selector, travel: NDArray[np.float64], weight: float) -> tuple[int, Stop]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import Candidates
+from edge_server.viewpoints.capture_planner import travel_m
 from edge_server.viewpoints.tuned_numbers import LIKENESS_RAD
 
 Array = NDArray[np.float64]
@@ -37,7 +38,7 @@ class StepFeatures:
         d = self.candidates.directions
         angle = np.arccos(np.clip(d @ d.T, -1.0, 1.0))
         alike = np.stack([np.exp(-((angle / width) ** 2)) for width in LIKENESS_RAD])
-        way = np.stack([self.candidates.travel_m(k) for k in range(len(d))])
+        way = np.stack([travel_m(self.candidates, k) for k in range(len(d))])
         at = self.candidates.poses[:, :3, 3] - self.candidates.target
         place = at / max(float(np.linalg.norm(at, axis=1).mean()), 1e-12)
         place = np.column_stack([place, place[:, 0] ** 2, place[:, 2] ** 2])

@@ -23,14 +23,14 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 import freshfield as ff
 from freshfield.files import read_status
 from freshfield.scenario import ScenarioError, load
-from freshfield_up import commands, processes
+from freshfield_up import child_process, commands
 from freshfield_up import healthy as health_check
 from freshfield_up import launcher as launcher
+from freshfield_up.child_process import Child
 from freshfield_up.cli import main, seconds
 from freshfield_up.commands import ProcessSet
 from freshfield_up.deployment import DeploymentError
 from freshfield_up.folder import EARLIER, KEY, MARKER, FolderError, forget_earlier, prepare
-from freshfield_up.processes import Child
 from freshfield_up.status import status_line, summarize
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
 from tests.conftest import ROOT
@@ -129,8 +129,8 @@ def test_times_and_commands_are_read_and_written_as_people_write_them():
 
 
 def test_the_signals_of_native_code_are_explained():
-    assert processes.describe_exit(-signal.SIGILL).endswith("SIGILL (an instruction this processor does not have)")
-    assert processes.describe_exit(-signal.SIGTERM) == "was killed by SIGTERM"
+    assert child_process.describe_exit(-signal.SIGILL).endswith("SIGILL (an instruction this processor does not have)")
+    assert child_process.describe_exit(-signal.SIGTERM) == "was killed by SIGTERM"
 
 
 def test_what_cannot_run_is_refused_in_one_line_before_anything_starts(tmp_path, capsys):
@@ -297,7 +297,7 @@ def test_a_child_becomes_its_command_and_runs_no_python_between_fork_and_exec(tm
     """There it might wait forever for a lock that another thread of the launcher held."""
     options: list[str] = []
     start = subprocess.Popen
-    monkeypatch.setattr(processes.subprocess, "Popen", lambda *a, **b: options.extend(b) or start(*a, **b))
+    monkeypatch.setattr(child_process.subprocess, "Popen", lambda *a, **b: options.extend(b) or start(*a, **b))
     child = python(tmp_path, "import os, signal, sys; print(os.getpid(), sys.argv, signal.getsignal(signal.SIGTERM))")
     child.start()
     wait_until(lambda: not child.running, "it did not end")
@@ -313,7 +313,7 @@ def test_stop_terminates_first_and_kills_after_the_grace_time(tmp_path):
         child.start()
         wait_until(lambda child=child: "\nup\n" in child.log.read_text(), "it did not start")
     began = time.monotonic()
-    processes.stop([python(tmp_path, ""), obedient, stubborn], grace_s=1.0)  # the first has not begun
+    child_process.stop([python(tmp_path, ""), obedient, stubborn], grace_s=1.0)  # the first has not begun
     assert time.monotonic() - began < 5.0
     assert not obedient.running and not stubborn.running
     assert not obedient.killed and obedient.process.returncode == 0 and "goodbye" in obedient.log.read_text()
@@ -325,13 +325,13 @@ def test_no_child_outlives_a_launcher_that_was_killed_outright(tmp_path):
     launcher = """
 import sys, time
 from pathlib import Path
-from freshfield_up.processes import Child
+from freshfield_up.child_process import Child
 child = Child("c", "c", [sys.executable, "-c", "import time; time.sleep(60)"], Path(sys.argv[1]))
 child.start()
 print(child.pid, flush=True)
 time.sleep(60)
 """
-    deploy = Path(processes.__file__).parents[1]
+    deploy = Path(child_process.__file__).parents[1]
     command = [sys.executable, "-c", launcher, str(tmp_path / "log.txt")]
     with subprocess.Popen(command, cwd=deploy, stdout=subprocess.PIPE) as parent:
         pid = int(parent.stdout.readline())

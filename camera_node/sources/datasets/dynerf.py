@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from camera_node.sources.datasets.imaging import read_numbers
+from camera_node.sources.datasets.image_reading import read_numbers
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
 from camera_node.sources.datasets.video import Clip, rig_dataset

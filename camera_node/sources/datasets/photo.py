@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.sources.datasets.imaging import composite, image_size, read_image, resize, shrink
+from camera_node.sources.datasets.image_reading import composite, image_size, read_image, resize, shrink
 from camera_node.sources.datasets.lens import Lens, exact, pinhole, undistort
 from camera_node.sources.datasets.records import (
     Dataset,

@@ -19,7 +19,7 @@ from typing import Any, get_args
 import numpy as np
 
 from camera_node.settings import Background
-from camera_node.sources.datasets.imaging import image_size
+from camera_node.sources.datasets.image_reading import image_size
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions, NoImages
 from camera_node.sources.datasets.records import (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from camera_node.sources import tuned_numbers as tuned
 from camera_node.sources.base import rate
-from camera_node.sources.datasets.imaging import as_image, resize, shrink
+from camera_node.sources.datasets.image_reading import as_image, resize, shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import (
     Dataset,

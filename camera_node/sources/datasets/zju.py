@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.settings import ZJU_FPS
-from camera_node.sources.datasets.imaging import image_size
+from camera_node.sources.datasets.image_reading import image_size
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.npy import load_object
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions

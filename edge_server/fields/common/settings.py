@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
+from edge_server.fields.common import tuned_numbers as tuned
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 
 BATCH = 2048  # ``kernels.train.CHUNK``, samples; settings do not load kernels
@@ -50,9 +51,9 @@ class FieldSettings(Settings, frozen=True):
         about("worker threads; results do not depend on it; not given: $FRESHFIELD_THREADS, or one a core, at most 8"),
     ] = None
     nice: Annotated[int, within(0, 19, "niceness added to worker threads (Linux); in a server 5")] = 0
-    min_views: int = 2
-    rate_end: float = 0.1
-    epsilon: float = 5e-3
+    min_views: int = tuned.MIN_VIEWS
+    rate_end: float = tuned.RATE_END
+    epsilon: float = tuned.EPSILON
 
     @property
     def module(self) -> str:
@@ -89,17 +90,17 @@ class TrainerSettings(FieldSettings, frozen=True):
     )
     refine_m: Annotated[float, within(0, 1, "largest correction of a camera's position, meters; 0: none")] = 0.0
     refine_deg: Annotated[float, within(0, 20, "largest correction of a camera's rotation, degrees; 0: none")] = 0.0
-    hidden: int = 32
-    hidden_layers: int = 1
-    rate: float = 8e-2
-    rate_net: float = 2e-2
-    samples_start: int = 64
-    samples_ramp: int = 600
-    cells: int = 64
-    distortion: float = 1e-2
+    hidden: int = tuned.HIDDEN
+    hidden_layers: int = tuned.HIDDEN_LAYERS
+    rate: float = tuned.RATE
+    rate_net: float = tuned.RATE_NET
+    samples_start: int = tuned.SAMPLES_START
+    samples_ramp: int = tuned.SAMPLES_RAMP
+    cells: int = tuned.OCCUPANCY_CELLS
+    distortion: float = tuned.DISTORTION
     appearance: int = 0
     depth_guide: float | None = None
-    guide_steps: int = 300
+    guide_steps: int = tuned.GUIDE_STEPS
 
     def __post_init__(self) -> None:
         if self.batch_samples % BATCH:

@@ -27,8 +27,10 @@ LENS_FIELD = 1.3  # times a camera's field of view, within which a projection's 
 # and those around them.
 CHANGE, MARGIN_PX = 16, 2
 SAME_POSE = 1e-3  # of all numbers of a matrix: a camera whose pose differs by more has moved
+MIN_VIEWS = 2  # no density where fewer cameras look, or all, if there are fewer
 
 # --- cells of space that get samples (occupancy_grid) ---
+OCCUPANCY_CELLS = 64  # a side, a multiple of 4
 OCCUPANCY_EVERY = 8  # steps between refreshes
 OCCUPANCY_PHASES = 4  # refreshes until every cell has been sampled
 OCCUPANCY_FADE = 0.75  # share of a cell's density that is left at each sample
@@ -56,6 +58,12 @@ GRADIENT_LIMIT = 1e3  # a hundred times what healthy scenes show; keeps the seco
 PARAMETER_LIMIT = 1e2
 FIRST_DENSITY = 0.3  # a scene unit of fog dims by a quarter: every sample gets a gradient at first
 FIRST_OUTPUTS = 0.1  # factor on the first weights of a network's last layer: gray fog
+# Where a representation's settings say nothing else:
+EPSILON = 5e-3  # of Adam: rarely seen vertices are trusted less
+RATE, RATE_NET, RATE_END = 8e-2, 2e-2, 0.1  # of encodings and networks as a fit begins; the share left at its end
+HIDDEN, HIDDEN_LAYERS = 32, 1  # units of a layer (a multiple of 4), and layers
+SAMPLES_START, SAMPLES_RAMP = 64, 600  # steps along a ray at first, as early fields are foggy; steps to the full number
+DISTORTION = 1e-2  # weight of the loss that gathers density along rays
 LATE = 1.1  # times a budget in seconds: a fit may end so late rather than make no step
 STEP_TIMES = 5  # latest ones whose median tells how long a step takes
 LOSS_STEPS = 32  # latest ones of a fit whose mean loss is reported
@@ -74,6 +82,7 @@ GUIDE_VIEWS = 3  # fewest views that must see a cell: two agree on a color too o
 # budget in seconds that its plane sweep may take; distance of weight from it, as a share of its own distance, at which
 # that costs half of the most.
 GUIDE_WEIGHT, FEW_VIEWS, SWEEP_SHARE, GUIDE_REACH = 0.1, 6, 0.5, 0.04
+GUIDE_STEPS = 300  # after which the guide weighs nothing any more
 
 # --- threads (threads.brief_wait, threads.thread_pool) ---
 # Looks of a wait, each followed by a pause of the core, of 30 to 140 cycles: 20 to 90 us; without a pause (not x86) a

@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from edge_server.scheduler.learned import tuned_numbers as tuned
 from edge_server.scheduler.learned.state import StateLayout, require_int
 from freshfield import limits
 from freshfield.limits import LONGEST_MS
@@ -35,16 +36,16 @@ class Spec:
     action: Action
     layout: StateLayout = field(default_factory=lambda: StateLayout(("age",)))
     omegas_ms: tuple[float, ...] = ()
-    hidden: int = 64
+    hidden: int = tuned.HIDDEN
     hold_ms: float = 0.0
-    learning_rate: float = 3e-3
-    clip: float = 0.2
-    passes: int = 10
-    minibatch: int = 64
-    entropy: float = 0.003
-    value: float = 0.5
-    max_gradient: float = 0.5
-    target_kl: float = 0.05
+    learning_rate: float = tuned.LEARNING_RATE
+    clip: float = tuned.CLIP
+    passes: int = tuned.PASSES
+    minibatch: int = tuned.MINIBATCH
+    entropy: float = tuned.ENTROPY
+    value: float = tuned.VALUE
+    max_gradient: float = tuned.MAX_GRADIENT
+    target_kl: float = tuned.TARGET_KL
 
     def __post_init__(self) -> None:
         if self.action not in ACTIONS:

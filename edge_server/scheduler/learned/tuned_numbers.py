@@ -13,7 +13,12 @@ FEATURE_LIMIT = 8.0
 # A feature that hardly varied where it was standardized says nothing; scaling must not turn it into noise.
 MIN_SPREAD = 1e-3
 
-# --- learning (ppo) ---
+# --- learning (``Spec`` in settings, ppo) ---
+HIDDEN = 64  # width of all layers
+LEARNING_RATE, MINIBATCH, MAX_GRADIENT = 3e-3, 64, 0.5  # of Adam's steps; bound of the gradient's norm
+CLIP = 0.2  # epsilon of (5.23): probability ratios are clipped to 1 - epsilon ... 1 + epsilon
+PASSES, TARGET_KL = 10, 0.05  # over a batch; they end early once the policy has moved by so many nats
+ENTROPY, VALUE = 0.003, 0.5  # weights of these terms of the loss
 # Advantages that differ by less than this share of the rewards' standard deviation are errors of V.
 # Normalization does not scale them up to 1.
 MIN_ADVANTAGE_STD = 0.05

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edge_server.viewpoints.candidates import ViewpointError, half_hemisphere
+from edge_server.viewpoints.capture_planner import travel_m
 from edge_server.viewpoints.experts import SimulatedExpert, judge
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
 from edge_server.viewpoints.preference_model import Answer, fit_reward, random_pair
@@ -93,7 +94,7 @@ def test_features_of_a_trajectory_are_those_of_its_steps():
     np.testing.assert_allclose(steps.trajectory(order), expected)
     again = steps.actions([3])[3]
     assert np.abs(again[GEOMETRY.index("first view within 0.5 rad")]) < 1e-12 and again[GEOMETRY.index("way")] == 0
-    far = int(np.argmax(DOME.travel_m(3)))
+    far = int(np.argmax(travel_m(DOME, 3)))
     assert steps.actions([3])[far, GEOMETRY.index("first view within 0.5 rad")] > 0
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.sources import tuned_numbers as tuned
-from camera_node.sources.datasets.imaging import decode_file, read_numbers, shrink
+from camera_node.sources.datasets.image_reading import decode_file, read_numbers, shrink
 from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import Photo
 from camera_node.sources.datasets.records import DatasetError

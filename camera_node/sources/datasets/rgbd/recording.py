@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from camera_node.pose.pairing import PoseGapError, SampleBuffer
 from camera_node.pose.providers import FixedPose, PoseProvider
-from camera_node.sources.datasets.imaging import as_image, resize, shrink
+from camera_node.sources.datasets.image_reading import as_image, resize, shrink
 from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, Image, PosedImage, errors_at
