@@ -15,16 +15,9 @@ from typing import Any
 import grpc
 import viser
 
+from edge_server.page import tuned_numbers as tuned
 from edge_server.page.controls import notify
 from edge_server.page.markup import html
-from edge_server.page.tuned_numbers import (
-    ANSWER_S,
-    MAX_SLIDER_DELAY_MS,
-    NETWORKS,
-    SLIDER_SETTLES_S,
-    SLIDER_STEP_MS,
-    STATUS_LAG_S,
-)
 from freshfield.transport import Transport, peer_text
 from freshfield.v1 import channel_pb2, channel_pb2_grpc
 
@@ -55,7 +48,7 @@ class EmulatorControl:
         with self._transport.channel(self._address) as channel:
             ask = channel_pb2_grpc.ChannelServiceStub(channel).SetChannel
             try:
-                ask(request, timeout=ANSWER_S, metadata=self._metadata)
+                ask(request, timeout=tuned.ANSWER_S, metadata=self._metadata)
             except grpc.RpcError as error:
                 said = f"{error.code().name}: {peer_text(error.details())}"
                 raise RuntimeError(f"the emulator at {self._address} refuses ({said})") from None
@@ -69,9 +62,9 @@ class NetworkControl:
         self._network = network
         self._timer: threading.Timer | None = None
         self._refresh_after_s = 0.0
-        self.buttons: Any = gui.add_button_group("network", (SCENARIO, *NETWORKS))
+        self.buttons: Any = gui.add_button_group("network", (SCENARIO, *tuned.NETWORKS))
         self.delay: Any = gui.add_slider(
-            "delay, ms", 0, MAX_SLIDER_DELAY_MS, SLIDER_STEP_MS, 0, hint="Mean delay of a frame."
+            "delay, ms", 0, tuned.MAX_SLIDER_DELAY_MS, tuned.SLIDER_STEP_MS, 0, hint="Mean delay of a frame."
         )
         self.loss: Any = gui.add_slider("loss, %", 0, 100, 1, 0, hint="Share of the frames that never arrive.")
         self.words: Any = gui.add_html("")
@@ -95,7 +88,7 @@ class NetworkControl:
         self._place_sliders(*(in_force or (_drawn_ms(status), 0.0)))
 
     def _place_sliders(self, delay_ms: float, loss: float) -> None:
-        values = round(min(delay_ms, MAX_SLIDER_DELAY_MS)), round(100.0 * loss)
+        values = round(min(delay_ms, tuned.MAX_SLIDER_DELAY_MS)), round(100.0 * loss)
         for slider, value in zip((self.delay, self.loss), values):
             if slider.value != value:
                 slider.value = value
@@ -104,20 +97,20 @@ class NetworkControl:
 
     async def _pressed(self, event: Any) -> None:
         # A coroutine runs before the next click is handled, so the group still holds this click's value.
-        wanted = NETWORKS.get(event.target.value)
+        wanted = tuned.NETWORKS.get(event.target.value)
         self._set_after(0.0, event.client, wanted)
         # At once: a slider that is moved now sets the other one's value too.
         self._place_sliders(*(wanted or (float(self.delay.value), 0.0)))
 
     def _moved(self, event: Any) -> None:
         if event.client is not None:  # not set by refresh
-            self._set_after(SLIDER_SETTLES_S, event.client, (float(self.delay.value), self.loss.value / 100.0))
+            self._set_after(tuned.SLIDER_SETTLES_S, event.client, (float(self.delay.value), self.loss.value / 100.0))
 
     def _set_after(self, seconds: float, client: Any, wanted: Setting) -> None:
         """Set it unless another change comes first: a slider that is dragged is one change."""
         if self._timer is not None:
             self._timer.cancel()
-        self._refresh_after_s = time.monotonic() + seconds + STATUS_LAG_S
+        self._refresh_after_s = time.monotonic() + seconds + tuned.STATUS_LAG_S
         self._timer = threading.Timer(seconds, self._set, (client, wanted))
         self._timer.name, self._timer.daemon = "page-network", True
         self._timer.start()
@@ -143,5 +136,5 @@ def describe(setting: Setting) -> str:
     """A setting in words."""
     if setting is None:
         return "the scenario's"
-    name = next((name for name, each in NETWORKS.items() if each == setting), "set by hand")
+    name = next((name for name, each in tuned.NETWORKS.items() if each == setting), "set by hand")
     return f"{name}: mean delay {setting[0]:.0f} ms, {100.0 * setting[1]:.0f} % of the frames lost"

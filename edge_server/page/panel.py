@@ -12,21 +12,13 @@ import viser
 
 from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
 from edge_server.page import markup, views
+from edge_server.page import tuned_numbers as tuned
 from edge_server.page.controls import ControlPanel
 from edge_server.page.diagnosis import poor_picture
 from edge_server.page.markup import html
 from edge_server.page.network_control import EmulatorControl, NetworkControl
 from edge_server.page.rendering import browser_image
 from edge_server.page.timelines import History, Timelines
-from edge_server.page.tuned_numbers import (
-    AGE_PARTS_OF,
-    LEAST_SCENE_PX,
-    MAIN_PANEL_PX,
-    PAIR_JPEG_QUALITY,
-    PAIR_PX,
-    POSE_NOISE,
-    SIDE_PANEL_PX,
-)
 from edge_server.run_records import age_parts_ms
 from freshfield import coverage
 
@@ -39,7 +31,7 @@ class Panel:
         gui = server.gui
         gui.set_panel_label("freshfield")
         gui.main_panel.dock_right()
-        gui.main_panel.set_width(MAIN_PANEL_PX)
+        gui.main_panel.set_width(tuned.MAIN_PANEL_PX)
         gui.add_html(html("intro"))
         if state.warnings:
             gui.add_html(html("warning", f"Insecure: {'; '.join(state.warnings)}."))
@@ -71,13 +63,13 @@ class Panel:
             self._reckoned_for: dict[str, coverage.Camera] = {}
             self._reckoned_with_depth = False
         side.dock_left()
-        side.set_width(SIDE_PANEL_PX)
+        side.set_width(tuned.SIDE_PANEL_PX)
         self._gui, self._side = gui, side
         self._made_room: WeakSet[viser.ClientHandle] = WeakSet()
 
     def make_room(self, client: viser.ClientHandle) -> None:
         """Fold up the timelines, once, of a visitor whose window is so narrow that both panels hide the scene."""
-        if client.camera.image_width < LEAST_SCENE_PX and client not in self._made_room:
+        if client.camera.image_width < tuned.LEAST_SCENE_PX and client not in self._made_room:
             self._made_room.add(client)
             panel = client.gui.main_panel  # a handle that speaks to this visitor alone
             with contextlib.suppress(AttributeError):  # viser's own: a version that calls it otherwise folds nothing
@@ -141,11 +133,11 @@ class Panel:
             comparison.camera, scored.psnr_db if scored else None, comparison.number, held_out
         )
         rows, columns = comparison.truth.shape[:2]
-        height = max(1, round(PAIR_PX / 2 * rows / columns))
-        pair = browser_image(views.compared(comparison, PAIR_PX, height, error=False, labeled=False))
+        height = max(1, round(tuned.PAIR_PX / 2 * rows / columns))
+        pair = browser_image(views.compared(comparison, tuned.PAIR_PX, height, error=False, labeled=False))
         if self._pair is None:
             order = self._caption.order + 0.5  # below its caption
-            self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=PAIR_JPEG_QUALITY, order=order)
+            self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=tuned.PAIR_JPEG_QUALITY, order=order)
         else:
             self._pair.image = pair
 
@@ -153,7 +145,7 @@ class Panel:
 def _same_places(cameras: Mapping[str, coverage.Camera], others: Mapping[str, coverage.Camera]) -> bool:
     """Whether the same cameras stand where they stood, but for the noise of their poses."""
     return cameras.keys() == others.keys() and all(
-        np.allclose(pose, others[name][1], atol=POSE_NOISE) for name, (_, pose) in cameras.items()
+        np.allclose(pose, others[name][1], atol=tuned.POSE_NOISE) for name, (_, pose) in cameras.items()
     )
 
 
@@ -179,5 +171,5 @@ def summary(state: EdgeState, cameras: list[CameraView], publications: list[Publ
         reporting=sum(c.age_ms is not None for c in cameras),
         cameras=len(cameras),
         t_s=state.now_s(),
-        age_parts_ms=age_parts_ms(publications[-AGE_PARTS_OF:], state.now_s()),
+        age_parts_ms=age_parts_ms(publications[-tuned.AGE_PARTS_OF :], state.now_s()),
     )

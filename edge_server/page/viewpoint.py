@@ -7,20 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_server.page.tuned_numbers import (
-    ABOVE_CAMERAS_DEG,
-    AHEAD_OF_SPREAD,
-    DISTANCE,
-    ELEVATION_DEG,
-    LEAST_AHEAD_M,
-    SCATTERED,
-    VERTICAL_FOV_DEG,
-)
+from edge_server.page import tuned_numbers as tuned
 from freshfield.geometry import Pinhole, converging_point, quaternion_to_matrix, world_up
 
 Array = NDArray[np.float64]
 
-VERTICAL_FOV_RAD = float(np.deg2rad(VERTICAL_FOV_DEG))
+VERTICAL_FOV_RAD = float(np.deg2rad(tuned.VERTICAL_FOV_DEG))
 
 
 @dataclass(frozen=True)
@@ -47,20 +39,22 @@ def initial_viewpoint(poses: ArrayLike, center: ArrayLike | None = None) -> View
     center = center if meeting is None else meeting
     if center is None:
         spread = float(np.linalg.norm(eyes - eyes.mean(axis=0), axis=1).mean())
-        ahead = axes.mean(axis=0) if np.linalg.norm(axes.mean(axis=0)) > SCATTERED else axes[0]
-        center = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(AHEAD_OF_SPREAD * spread, LEAST_AHEAD_M)
+        ahead = axes.mean(axis=0) if np.linalg.norm(axes.mean(axis=0)) > tuned.SCATTERED else axes[0]
+        center = eyes.mean(axis=0) + ahead / np.linalg.norm(ahead) * max(
+            tuned.AHEAD_OF_SPREAD * spread, tuned.LEAST_AHEAD_M
+        )
     center = np.asarray(center, dtype=np.float64)
     radius = float(np.median(np.linalg.norm(eyes - center, axis=1)))
     radius = max(radius, 1e-2)
     direction = _outward(eyes - center, up, radius)
-    return Viewpoint(center + direction * DISTANCE * radius, center, up, radius)
+    return Viewpoint(center + direction * tuned.DISTANCE * radius, center, up, radius)
 
 
 def _outward(offsets: Array, up: Array, radius: float) -> Array:
     """Unit vector from the center to the visitor, above the mean camera. offsets: (N, 3) meters."""
     flat = offsets - (offsets @ up)[:, None] * up
     behind = flat.mean(axis=0)
-    if np.linalg.norm(behind) < SCATTERED * radius:  # a ring of cameras: behind the first
+    if np.linalg.norm(behind) < tuned.SCATTERED * radius:  # a ring of cameras: behind the first
         behind = flat[0]
     if np.linalg.norm(behind) < 1e-6 * radius:  # it looks straight down: any side
         least = np.zeros(3)
@@ -68,8 +62,8 @@ def _outward(offsets: Array, up: Array, radius: float) -> Array:
         behind = np.cross(up, least)
     behind = behind / np.linalg.norm(behind)
     heights = offsets @ up / np.maximum(np.linalg.norm(offsets, axis=1), 1e-9)
-    elevation = np.rad2deg(np.arcsin(np.clip(np.mean(heights), -1, 1))) + ABOVE_CAMERAS_DEG
-    elevation = np.deg2rad(np.clip(elevation, *ELEVATION_DEG))
+    elevation = np.rad2deg(np.arcsin(np.clip(np.mean(heights), -1, 1))) + tuned.ABOVE_CAMERAS_DEG
+    elevation = np.deg2rad(np.clip(elevation, *tuned.ELEVATION_DEG))
     return behind * np.cos(elevation) + up * np.sin(elevation)
 
 

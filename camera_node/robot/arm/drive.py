@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.arm import ArmError
+from camera_node.robot.arm import tuned_numbers as tuned
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_flange, require_arm
 from camera_node.robot.arm.control import (
     confirm_motion,
@@ -28,15 +29,6 @@ from camera_node.robot.arm.control import (
     stop_within_timeout,
 )
 from camera_node.robot.arm.joint_states import ArmStream
-from camera_node.robot.arm.tuned_numbers import (
-    ARRIVED_RAD,
-    FARTHEST_RAD,
-    MOVED_RAD,
-    POLL_S,
-    STALLED_RAD,
-    STALLED_S,
-    STOP_RAD_S2,
-)
 from camera_node.robot.arm.viewpoint_tour import Tour, plan_tour
 from camera_node.settings import PathConfig, errors_of
 from freshfield.scenario import ScenarioError, load
@@ -61,15 +53,15 @@ def run(args: argparse.Namespace) -> int:
         _print_tour(tour, start, first_rad)
         if args.show:
             return 0
-        if first_rad > FARTHEST_RAD and not config.simulated:
+        if first_rad > tuned.FARTHEST_RAD and not config.simulated:
             raise ArmError(
                 f"arm at {config.host}: the first move would turn a joint by {np.rad2deg(first_rad):.0f} "
-                f"degrees, more than {np.rad2deg(FARTHEST_RAD):.0f}: bring it nearer to the first viewpoint "
+                f"degrees, more than {np.rad2deg(tuned.FARTHEST_RAD):.0f}: bring it nearer to the first viewpoint "
                 "with the pendant"
             )
         if not (args.yes or config.simulated or confirm_motion(config.host, "move")):
             return 2
-        if np.abs(stream.now() - start).max() > MOVED_RAD:
+        if np.abs(stream.now() - start).max() > tuned.MOVED_RAD:
             raise ArmError(f"arm at {config.host}: it has been moved since the tour was printed: start again")
         return _drive(stream, tour.stops, config.path, args.rounds)
     finally:
@@ -91,7 +83,7 @@ def _drive(stream: ArmStream, stops: list[np.ndarray], path: PathConfig, rounds:
     stop_requested = stop_event()
 
     def stop() -> None:
-        control.stopJ(STOP_RAD_S2)
+        control.stopJ(tuned.STOP_RAD_S2)
         control.stopScript()
 
     try:
@@ -121,12 +113,12 @@ def _reason(stream: ArmStream) -> str:
 def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_requested: threading.Event) -> None:
     """Wait until the joints reach ``goal``, or until asked to stop. Raises ArmError if the arm's state is too
     old, or if it stalls or its program ends on the way."""
-    patience_s = max(STALLED_S, stream.stale_s)
+    patience_s = max(tuned.STALLED_S, stream.stale_s)
     at, moved_s = np.full(6, np.inf), 0.0
-    while not stop_requested.wait(POLL_S):
+    while not stop_requested.wait(tuned.POLL_S):
         joints, now_s = joints_in_motion(stream), time.monotonic()
         left_rad = float(np.abs(joints - goal).max())
-        if left_rad < ARRIVED_RAD:
+        if left_rad < tuned.ARRIVED_RAD:
             return
         where = f"{np.rad2deg(left_rad):.1f} degrees from its goal"
         if not (control.isProgramRunning() and control.kickWatchdog()):
@@ -134,7 +126,7 @@ def _wait_until_arrived(stream: ArmStream, control: Any, goal: np.ndarray, stop_
                 f"arm at {stream.host}: its program was ended {where}: at the pendant, by a fault, or by "
                 "leaving remote control"
             )
-        if np.abs(joints - at).max() > STALLED_RAD:
+        if np.abs(joints - at).max() > tuned.STALLED_RAD:
             at, moved_s = joints, now_s
         elif now_s - moved_s > patience_s:
             raise ArmError(

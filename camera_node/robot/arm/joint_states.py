@@ -26,17 +26,9 @@ from camera_node.clocks import ArrivalClock
 from camera_node.pose.pairing import SampleBuffer, interpolate_joints
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm import ArmError
+from camera_node.robot.arm import tuned_numbers as tuned
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.arm.rtde_process import SAMPLE
-from camera_node.robot.arm.tuned_numbers import (
-    BACKOFF_S,
-    CONNECT_S,
-    JOIN_S,
-    NEXT_STATE_POLL_S,
-    NEXT_STATE_S,
-    PROBE_S,
-    STALE_S,
-)
 from freshfield.clock import Clock
 from freshfield.geometry import Array, Pose
 
@@ -73,9 +65,9 @@ def probe(host: str) -> None:
     """Check that a controller answers at ``host``, without the library, which would wait forever. Raises
     ArmError within ``PROBE_S``."""
     where = f"arm at {host}"
-    deadline = time.monotonic() + PROBE_S
+    deadline = time.monotonic() + tuned.PROBE_S
     try:
-        with socket.create_connection((host, RTDE_PORT), PROBE_S) as link:
+        with socket.create_connection((host, RTDE_PORT), tuned.PROBE_S) as link:
             link.sendall(b"\x00\x05V\x00\x02")  # request protocol version 2
             answer = b""
             while len(answer) < 4:
@@ -114,7 +106,7 @@ class ArmStream:
         frequency_hz: float = 125.0,
         interpolate: bool = True,
         max_gap_ms: float = 20.0,
-        stale_s: float = STALE_S,
+        stale_s: float = tuned.STALE_S,
     ) -> None:
         self.host, self.stale_s = host, stale_s
         self.trouble = "not connected yet"
@@ -135,7 +127,7 @@ class ArmStream:
         probe(self.host)
         atexit.register(self.stop)
         self._thread.start()
-        if not self._first_sample.wait(CONNECT_S):
+        if not self._first_sample.wait(tuned.CONNECT_S):
             trouble = self.trouble
             self.stop()
             raise ArmError(f"arm at {self.host}: connected, but no joint states come: {trouble}")
@@ -146,7 +138,7 @@ class ArmStream:
         atexit.unregister(self.stop)
         self._end_child()
         if self._thread.is_alive():
-            self._thread.join(JOIN_S)
+            self._thread.join(tuned.JOIN_S)
 
     def at(self, t_ns: int, wait_s: float = 0.0) -> tuple[Array, int]:
         """Joint angles (6,) at an instant, and its distance (ns) from the nearest sample. Raises
@@ -156,7 +148,7 @@ class ArmStream:
         """
         until = time.monotonic() + wait_s
         while self._interpolate and not self._samples.ready(t_ns) and time.monotonic() < until:
-            if self._stop.wait(NEXT_STATE_POLL_S):
+            if self._stop.wait(tuned.NEXT_STATE_POLL_S):
                 break
         try:
             return self._samples.at(t_ns)
@@ -185,7 +177,7 @@ class ArmStream:
                     failures = 0
             except ArmError as error:
                 self._set_trouble(str(error))
-            pause_s = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
+            pause_s = tuned.BACKOFF_S[min(failures, len(tuned.BACKOFF_S) - 1)]
             failures += 1
             self._stop.wait(pause_s)
 
@@ -196,7 +188,7 @@ class ArmStream:
         )
         self._child = child
         assert child.stdout is not None and child.stderr is not None
-        received, patience_s = False, CONNECT_S
+        received, patience_s = False, tuned.CONNECT_S
         clock, last_s, pending = ArrivalClock(), -1.0, b""
         try:
             while not self._stop.is_set():
@@ -261,7 +253,7 @@ class FlangePoses:
     """
 
     def __init__(
-        self, stream: ArmStream, model: ArmModel, base: NDArray[np.float64], wait_s: float = NEXT_STATE_S
+        self, stream: ArmStream, model: ArmModel, base: NDArray[np.float64], wait_s: float = tuned.NEXT_STATE_S
     ) -> None:
         self._stream, self._model, self._base, self._wait_s = stream, model, base, wait_s
 

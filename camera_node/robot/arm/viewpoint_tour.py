@@ -16,16 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm import ArmError
+from camera_node.robot.arm import tuned_numbers as tuned
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.tuned_numbers import (
-    CHECKED_POSTURES,
-    FARTHEST_RAD,
-    LEAST_VIEWPOINTS,
-    MARGIN_M,
-    TOOL_M,
-    TOOL_RADIUS_M,
-)
 from camera_node.settings import PathConfig
 from freshfield.geometry import Array, on_sphere, se3, se3_inverse, so3_exp
 
@@ -83,7 +76,7 @@ def plan_tour(arm: ArmModel, base: Array, mount: Array, path: PathConfig, start:
             tour, used = _extend_tour(arm, base, path.floor_m, joints, places, int(k))
             visited |= used
             best = max(best, tour, key=lambda each: each.reached)
-    if best.reached < LEAST_VIEWPOINTS:
+    if best.reached < tuned.LEAST_VIEWPOINTS:
         raise ArmError(
             f"the arm reaches {best.reached} of {len(poses)} viewpoints: change radius_m, elevations_deg, "
             "azimuths_deg, where the base stands, or the arm's posture before"
@@ -112,12 +105,12 @@ def is_free(arm: ArmModel, base: Array, a: Array, b: Array, floor_m: float) -> N
     floor_m: height of the floor in the world.
     """
     a, b = np.broadcast_arrays(np.atleast_2d(a), np.atleast_2d(b))
-    share = np.linspace(0.0, 1.0, CHECKED_POSTURES)[:, None, None]
+    share = np.linspace(0.0, 1.0, tuned.CHECKED_POSTURES)[:, None, None]
     frames = arm.nominal_model.link_frames((a + share * (b - a)).reshape(-1, 6))
     lowest_m = (base @ frames)[:, 2:, 2, 3].min(axis=1)
-    apart_m = CapsuleModel(arm, TOOL_M, TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
-    free = (lowest_m >= floor_m) & (apart_m >= MARGIN_M)
-    return np.asarray(free.reshape(CHECKED_POSTURES, -1).all(axis=0))
+    apart_m = CapsuleModel(arm, tuned.TOOL_M, tuned.TOOL_RADIUS_M).clearance(frames)[0].min(axis=1)
+    free = (lowest_m >= floor_m) & (apart_m >= tuned.MARGIN_M)
+    return np.asarray(free.reshape(tuned.CHECKED_POSTURES, -1).all(axis=0))
 
 
 def _free_postures(
@@ -162,7 +155,7 @@ def _extend_tour(
     while trail:
         at = trail[-1]
         near, far_rad = _turned_towards(arm, joints, at)
-        left = ~np.isin(places, visited) & (far_rad <= FARTHEST_RAD)
+        left = ~np.isin(places, visited) & (far_rad <= tuned.FARTHEST_RAD)
         order = np.flatnonzero(left)[np.argsort(far_rad[left], kind="stable")]
         step = next((k for k in order if is_free(arm, base, at, near[k], floor_m)[0]), None)
         if step is None:

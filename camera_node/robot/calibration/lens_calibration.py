@@ -10,18 +10,9 @@ import cv2
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import tuned_numbers as tuned
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.targets import Corners
-from camera_node.robot.calibration.tuned_numbers import (
-    COVERED_CELLS,
-    LARGEST_FOCAL_STD,
-    LONGEST_FOCAL,
-    MIN_CORNERS,
-    MIN_TILT_DEG,
-    MIN_VIEWS,
-    OUTLIER_ERROR,
-    SHORTEST_FOCAL,
-)
 from camera_node.sources.rig_calibration import calibration_entry
 from freshfield.geometry import Pinhole
 
@@ -78,38 +69,40 @@ def calibrate_lens(views: Mapping[str, Corners], size: tuple[int, int], unused: 
     unused: reasons for images without corners.
     Raises CalibrationError if the corners do not determine a lens.
     """
-    usable = {name: c for name, c in views.items() if len(c.points) >= MIN_CORNERS}
+    usable = {name: c for name, c in views.items() if len(c.points) >= tuned.MIN_CORNERS}
     unused = {**unused, **{name: f"only {len(c.points)} corners" for name, c in views.items() if name not in usable}}
-    if len(usable) < MIN_VIEWS:
+    if len(usable) < tuned.MIN_VIEWS:
         why = next((f"; {name}: {each}" for name, each in unused.items()), "")
         raise CalibrationError(
             f"too few pictures show the target: {len(usable)} of {len(usable) + len(unused)}, "
-            f"at least {MIN_VIEWS} are needed and 10 to 20 are good{why}"
+            f"at least {tuned.MIN_VIEWS} are needed and 10 to 20 are good{why}"
         )
     lens, std, normals, errors = _solve(usable, size)
-    limit = OUTLIER_ERROR * float(np.median(errors))
+    limit = tuned.OUTLIER_ERROR * float(np.median(errors))
     bad = [name for name, error in zip(usable, errors) if error > limit]
-    if bad and len(usable) - len(bad) >= MIN_VIEWS:
+    if bad and len(usable) - len(bad) >= tuned.MIN_VIEWS:
         unused = {**unused, **{name: "does not fit the others, left out" for name in bad}}
         usable = {name: c for name, c in usable.items() if name not in bad}
         lens, std, normals, errors = _solve(usable, size)
-    possible = all(SHORTEST_FOCAL < f / max(size) < LONGEST_FOCAL for f in (lens.fx, lens.fy))
+    possible = all(tuned.SHORTEST_FOCAL < f / max(size) < tuned.LONGEST_FOCAL for f in (lens.fx, lens.fy))
     if not (
         np.isfinite([lens.fx, lens.fy, *lens.distortion, *std]).all()
         and possible
-        and std[0] < LARGEST_FOCAL_STD * lens.fx
+        and std[0] < tuned.LARGEST_FOCAL_STD * lens.fx
     ):
         raise CalibrationError(_UNDETERMINED)
     tilt_deg = float(np.degrees(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0))))
-    if tilt_deg < MIN_TILT_DEG:
+    if tilt_deg < tuned.MIN_TILT_DEG:
         raise CalibrationError(
             f"the target was held the same way in all pictures (tilts differ by {tilt_deg:.1f} degrees, at "
-            f"least {MIN_TILT_DEG:g} are needed): focal length and distance cannot be told apart; tilt it"
+            f"least {tuned.MIN_TILT_DEG:g} are needed): focal length and distance cannot be told apart; tilt it"
         )
     counts = [len(c.points) for c in usable.values()]
     error_px = float(np.sqrt(np.average(np.square(errors), weights=counts)))
-    cells = [np.clip(c.pixels / size * COVERED_CELLS, 0, COVERED_CELLS - 1).astype(int) for c in usable.values()]
-    covered = len(np.unique(np.concatenate(cells), axis=0)) / COVERED_CELLS**2
+    cells = [
+        np.clip(c.pixels / size * tuned.COVERED_CELLS, 0, tuned.COVERED_CELLS - 1).astype(int) for c in usable.values()
+    ]
+    covered = len(np.unique(np.concatenate(cells), axis=0)) / tuned.COVERED_CELLS**2
     found = dict(zip(usable, errors.tolist()))
     return LensCalibration(lens, std, error_px, found, tilt_deg, covered, unused)
 

@@ -20,14 +20,8 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.episode import Stage, open_stage
+from edge_server.experiments.studies import tuned_numbers as tuned
 from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
-from edge_server.experiments.studies.tuned_numbers import (
-    FIRST_DECISION_MS,
-    SHOWN_INSTANTS,
-    STAGGER_MS,
-    TRIAL_FPS,
-    TRIAL_PATIENCE,
-)
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
@@ -81,7 +75,7 @@ class Trial:
     @property
     def first_ms(self) -> float:
         """Instant of the first decision."""
-        return FIRST_DECISION_MS + STAGGER_MS * (self.seed % 64)
+        return tuned.FIRST_DECISION_MS + tuned.STAGGER_MS * (self.seed % 64)
 
     def scenario(self) -> Scenario:
         """The deployment as a scenario. Raises ScenarioError."""
@@ -89,7 +83,7 @@ class Trial:
         source, edge = dict(shipped.source), dict(shipped.edge)
         cameras: Row = {"ids": list(shipped.cameras), "held_out": list(shipped.held_out)}
         if source.get("kind") == "world":
-            source |= {"width": self.size, "height": self.size, "fps": TRIAL_FPS}
+            source |= {"width": self.size, "height": self.size, "fps": tuned.TRIAL_FPS}
             if self.speed_m_per_s is not None and source.get("scene") != "tile":  # nothing moves there
                 source["speed_m_per_s"] = self.speed_m_per_s
             if self.cameras is not None:
@@ -276,7 +270,7 @@ def _decided(trial: Trial, folders: Folders, look: Callable[[Publication, Virtua
     )
     # Stop just before the second decision, whose update may not be needed.
     deployment.run((trial.first_ms + trial.every_ms) / 1e3 - _MOMENT_S)
-    for _ in range(TRIAL_PATIENCE):
+    for _ in range(tuned.TRIAL_PATIENCE):
         if found:
             return found[0]
         deployment.run(trial.every_ms / 1e3)
@@ -313,8 +307,8 @@ def _shown_scores(publication: Publication, deployment: VirtualDeployment, rng: 
     lasts_ns = max(began_ns - deployment.decided_ns, deployment.capture_period_ns)
     snapshot = deployment.updates.field.snapshot(began_ns)
     scores = []
-    for k, random in enumerate(rng.random(SHOWN_INSTANTS)):
-        at_ns = max(truth.nearest_ns(began_ns + round((k + random) / SHOWN_INSTANTS * lasts_ns)), began_ns)
+    for k, random in enumerate(rng.random(tuned.SHOWN_INSTANTS)):
+        at_ns = max(truth.nearest_ns(began_ns + round((k + random) / tuned.SHOWN_INSTANTS * lasts_ns)), began_ns)
         scores.append(truth.score(snapshot.at(at_ns), at_ns))
     return {f"shown_{name}": mean_or_none([getattr(s, name) for s in scores]) for name in SHOWN}
 

@@ -7,17 +7,10 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.splat import tuned_numbers as tuned
 from edge_server.fields.splat.kernels.optimizer_step import DEAD, OptimizerState, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, SH_COLUMNS, Gaussians
 from edge_server.fields.splat.settings import SplatSettings
-from edge_server.fields.splat.tuned_numbers import (
-    GROW_SHARE,
-    PRUNE_OPACITY,
-    SHARP_PX,
-    SPLIT_APART,
-    SPLIT_SHRINK,
-    WIDEST,
-)
 from freshfield.geometry import quaternion_to_matrix
 
 
@@ -95,13 +88,13 @@ def densify_and_prune(cloud: GaussianCloud, most: int, pixels: float, rng: np.ra
     pixels: width of the images.
     rng: draws where the halves go.
     """
-    kept = (cloud.looks > 0) & (opacity(cloud.params) >= PRUNE_OPACITY) & (cloud.params[:, OPACITY] > DEAD + 1e-3)
+    kept = (cloud.looks > 0) & (opacity(cloud.params) >= tuned.PRUNE_OPACITY) & (cloud.params[:, OPACITY] > DEAD + 1e-3)
     cloud.keep(kept)
     origin, n = np.flatnonzero(kept), len(cloud)
-    want = min(most - n, int(np.ceil(GROW_SHARE * n)))
+    want = min(most - n, int(np.ceil(tuned.GROW_SHARE * n)))
     if want > 0 and n > 0:
         slope = cloud.slope / np.maximum(cloud.looks, 1.0)
-        slope = np.where(cloud.reach > WIDEST, np.inf, slope)
+        slope = np.where(cloud.reach > tuned.WIDEST, np.inf, slope)
         # Stable, so that ties are broken alike on every machine.
         chosen = np.sort(np.argsort(-slope, kind="stable")[:want])
         chosen = chosen[slope[chosen] > 0]
@@ -118,12 +111,12 @@ def _split(cloud: GaussianCloud, chosen: NDArray[np.int64], pixels: float, rng: 
     size = np.exp(one[:, SCALE : SCALE + 3])
     rotation = quaternion_to_matrix(one[:, QUATERNION : QUATERNION + 4])
     offset = np.einsum("nij,nj->ni", rotation, rng.standard_normal((len(chosen), 3)) * size)
-    wide = cloud.reach[chosen] * pixels > SHARP_PX
-    one[:, SCALE : SCALE + 3] -= np.where(wide, np.log(SPLIT_SHRINK), 0.0)[:, None]
+    wide = cloud.reach[chosen] * pixels > tuned.SHARP_PX
+    one[:, SCALE : SCALE + 3] -= np.where(wide, np.log(tuned.SPLIT_SHRINK), 0.0)[:, None]
     one[:, OPACITY] = raw_opacity(1.0 - np.sqrt(1.0 - opacity(one)))
     two = one.copy()
-    one[:, :3] += SPLIT_APART * offset
-    two[:, :3] -= SPLIT_APART * offset
+    one[:, :3] += tuned.SPLIT_APART * offset
+    two[:, :3] -= tuned.SPLIT_APART * offset
     for half in (one, two):
         clamp_gaussians(half)
     cloud.params[chosen] = one

@@ -26,6 +26,7 @@ from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.common.view_store import Arrays, same_views
+from edge_server.fields.splat import tuned_numbers as tuned
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
@@ -34,14 +35,6 @@ from edge_server.fields.splat.kernels.rasterize import LOSSES, Targets
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
-from edge_server.fields.splat.tuned_numbers import (
-    RATE_COLOR,
-    RATE_OPACITY,
-    RATE_POSITION,
-    RATE_ROTATION,
-    RATE_SCALE,
-    RATE_SH,
-)
 
 
 class StillField(SteppedField[SplatSnapshot]):
@@ -231,11 +224,11 @@ class StillField(SteppedField[SplatSnapshot]):
         """Parameters of an optimizer step at ``progress``, in [0, 1], of a fit."""
         s, box = self.settings, self.view_store.box
         assert box is not None
-        rates = np.full(BASE + SH_COLUMNS * s.sh_degree, RATE_SH)
-        rates[:SCALE] = RATE_POSITION * box.pixel_m / box.radius_m
-        rates[SCALE:QUATERNION] = RATE_SCALE
-        rates[QUATERNION:OPACITY] = RATE_ROTATION
-        rates[OPACITY], rates[COLOR:BASE] = RATE_OPACITY, RATE_COLOR
+        rates = np.full(BASE + SH_COLUMNS * s.sh_degree, tuned.RATE_SH)
+        rates[:SCALE] = tuned.RATE_POSITION * box.pixel_m / box.radius_m
+        rates[SCALE:QUATERNION] = tuned.RATE_SCALE
+        rates[QUATERNION:OPACITY] = tuned.RATE_ROTATION
+        rates[OPACITY], rates[COLOR:BASE] = tuned.RATE_OPACITY, tuned.RATE_COLOR
         return AdamParameters(
             (rates * s.rate_end**progress).astype(np.float32), age_corrections(), np.float32(s.epsilon)
         )

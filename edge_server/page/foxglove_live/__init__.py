@@ -31,18 +31,7 @@ from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSIT
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.live.state import CameraView, EdgeState, Publication
-from edge_server.page.foxglove_live.tuned_numbers import (
-    BACKLOG,
-    IDLE_S,
-    JPEG_QUALITY,
-    LEAST_OPACITY,
-    MOST_POINTS,
-    MOST_ROWS,
-    POINTS_EVERY_S,
-    RENDER_EVERY_S,
-    RENDER_SHARE,
-    TICK_S,
-)
+from edge_server.page.foxglove_live import tuned_numbers as tuned
 from edge_server.page.page_thread import PageThread
 from edge_server.page.rendering import browser_image
 from edge_server.page.splats.records import weights
@@ -109,7 +98,7 @@ class FoxgloveServer(PageThread):
                 host="127.0.0.1",
                 port=port,
                 context=context,
-                message_backlog_size=BACKLOG,
+                message_backlog_size=tuned.BACKLOG,
             )
         except RuntimeError as error:
             raise TransportError(f"--foxglove-port {port}: {error}") from None
@@ -122,9 +111,9 @@ class FoxgloveServer(PageThread):
 
     def _step(self) -> float:
         if not any(channel.has_sinks() for channel in self._all):
-            return IDLE_S
+            return tuned.IDLE_S
         self._send()
-        return TICK_S
+        return tuned.TICK_S
 
     def _send(self) -> None:
         """Send what is new on the topics that somebody has subscribed to."""
@@ -144,14 +133,14 @@ class FoxgloveServer(PageThread):
         if field is None:
             return
         if now_s >= self._points_due_s and self._points.has_sinks():
-            self._points_due_s = now_s + POINTS_EVERY_S
+            self._points_due_s = now_s + tuned.POINTS_EVERY_S
             self._send_points(field)
         asked = self._images[RENDERED].has_sinks() or self._lenses[RENDERED].has_sinks()
         if asked and now_s >= self._render_due_s and seen_from is not None:
-            self._render_due_s = now_s + RENDER_EVERY_S  # also where it fails
+            self._render_due_s = now_s + tuned.RENDER_EVERY_S  # also where it fails
             self._send_rendering(field, seen_from)
             spent = perf_counter() - now_s
-            self._render_due_s = now_s + max(RENDER_EVERY_S, spent / RENDER_SHARE)
+            self._render_due_s = now_s + max(tuned.RENDER_EVERY_S, spent / tuned.RENDER_SHARE)
 
     def _frame(self, camera: str, frame: Frame, truth: bool) -> None:
         t_ns = frame.generated_edge_ns
@@ -163,7 +152,7 @@ class FoxgloveServer(PageThread):
             if form not in _VIEWED:
                 k = frame.intrinsics
                 pixels = np.ascontiguousarray(payload.decode(data, form, k.width, k.height)[..., :3])
-                data, form = payload.encode(pixels, "jpeg", JPEG_QUALITY), "jpeg"
+                data, form = payload.encode(pixels, "jpeg", tuned.JPEG_QUALITY), "jpeg"
             for channel in channels:
                 stamp = self._stamp(t_ns)
                 image = self._fox.CompressedImage(timestamp=stamp, frame_id=camera, data=data, format=form)
@@ -171,7 +160,7 @@ class FoxgloveServer(PageThread):
 
     def _publications(self) -> None:
         if self._decisions.has_sinks():
-            for publication in self._state.publications(self._last_decision)[-BACKLOG:]:
+            for publication in self._state.publications(self._last_decision)[-tuned.BACKLOG :]:
                 self._last_decision = publication.number
                 self._decisions.log(asdict(publication), log_time=publication.published_ns)
         scored = self._state.newest(scored=True)
@@ -183,9 +172,9 @@ class FoxgloveServer(PageThread):
         frame, now_ns = camera.newest, self._state.now_ns()
         assert frame is not None
         k = frame.intrinsics
-        lens = Pinhole(k.width, k.height, k.fx, k.fy, k.cx, k.cy).scaled(min(1.0, MOST_ROWS / k.height))
+        lens = Pinhole(k.width, k.height, k.fx, k.fy, k.cx, k.cy).scaled(min(1.0, tuned.MOST_ROWS / k.height))
         shown = field.at(now_ns).render(frame.pose.matrix(), lens)
-        data = payload.encode(browser_image(shown.color), "jpeg", JPEG_QUALITY)
+        data = payload.encode(browser_image(shown.color), "jpeg", tuned.JPEG_QUALITY)
         self._send_pose(RENDERED, frame.pose, now_ns)
         self._send_lens(RENDERED, lens, now_ns)
         image = self._fox.CompressedImage(timestamp=self._stamp(now_ns), frame_id=RENDERED, data=data, format="jpeg")
@@ -250,8 +239,8 @@ def point_cloud(field: Snapshot) -> NDArray[np.void] | None:
         return None
     static = field.static if isinstance(field, LayeredSnapshot) else None
     params = field.gaussians.params if static is None else static
-    weight = weights(params) * (params[:, OPACITY] > np.log(LEAST_OPACITY / (1.0 - LEAST_OPACITY)))
-    chosen = np.argsort(-weight, kind="stable")[: min(MOST_POINTS, int((weight > 0).sum()))]
+    weight = weights(params) * (params[:, OPACITY] > np.log(tuned.LEAST_OPACITY / (1.0 - tuned.LEAST_OPACITY)))
+    chosen = np.argsort(-weight, kind="stable")[: min(tuned.MOST_POINTS, int((weight > 0).sum()))]
     kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue", "alpha")]
     points = np.zeros(len(chosen), kinds)
     at = params[chosen, POSITION:SCALE] * field.box.radius_m + np.asarray(field.box.center_m)

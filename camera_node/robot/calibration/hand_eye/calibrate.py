@@ -11,6 +11,7 @@ import yaml
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
+from camera_node.robot.calibration import tuned_numbers as tuned
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, solve
 from camera_node.robot.calibration.hand_eye.refinement import Refinement, refine
 from camera_node.robot.calibration.hand_eye.samples import (
@@ -21,22 +22,6 @@ from camera_node.robot.calibration.hand_eye.samples import (
     distance_mm,
     diversity,
     rotation_vectors,
-)
-from camera_node.robot.calibration.tuned_numbers import (
-    FARTHEST_M,
-    GOOD_POSES,
-    LARGE_RESIDUAL_DEG,
-    LARGE_RESIDUAL_MM,
-    LARGEST_SCALE,
-    MILLIMETERS_M,
-    NOTABLE_DEG,
-    NOTABLE_MM,
-    NOTABLE_SCALE,
-    POSES_FOR_SCALE,
-    SURE,
-    WARNED_OUTLIERS,
-    WORST_DEG,
-    WORST_MM,
 )
 from freshfield import files
 from freshfield.untrusted import YamlWriter
@@ -136,7 +121,7 @@ def calibrate(
     if spread.reason is not None:
         raise CalibrationError(spread.reason)
     for what, poses in (("targets", samples.target), ("flanges", samples.flange)):
-        if np.median(np.linalg.norm(poses[:, :3, 3], axis=1)) > MILLIMETERS_M:
+        if np.median(np.linalg.norm(poses[:, :3, 3], axis=1)) > tuned.MILLIMETERS_M:
             raise CalibrationError(f"{what} seem to be in millimeters: targets and flanges must be in meters")
     scaled = _refined_with_scale(samples) if fit_size else None
     if scaled is not None:
@@ -163,11 +148,11 @@ def calibrate(
 
 def _refined_with_scale(samples: Samples) -> Refinement | None:
     """The refinement with the target's size, where the arm's motion shows another one than was said."""
-    if len(samples) < POSES_FOR_SCALE:
+    if len(samples) < tuned.POSES_FOR_SCALE:
         return None
     found = refine(samples, with_scale=True)
-    plausible = 1.0 / LARGEST_SCALE < found.scale < LARGEST_SCALE
-    sure = abs(found.scale - 1.0) > max(NOTABLE_SCALE, SURE * found.scale_std)
+    plausible = 1.0 / tuned.LARGEST_SCALE < found.scale < tuned.LARGEST_SCALE
+    sure = abs(found.scale - 1.0) > max(tuned.NOTABLE_SCALE, tuned.SURE * found.scale_std)
     return found if plausible and sure else None
 
 
@@ -187,29 +172,29 @@ def _about_size(scaled: Refinement, refined: Refinement, square_m: float | None,
 def _require_plausible(transform: Array, off: Residuals) -> None:
     """Raise CalibrationError for a result that cannot be right. Medians ignore a few outliers."""
     median_mm, median_deg = off.medians
-    if median_mm > WORST_MM or median_deg > WORST_DEG:
+    if median_mm > tuned.WORST_MM or median_deg > tuned.WORST_DEG:
         raise CalibrationError(
             f"the poses do not fit together (residuals {median_mm:.0f} mm, {median_deg:.1f} degrees in the "
             f"median): {_ADVICE}"
         )
     distance_m = float(np.linalg.norm(transform[:3, 3]))
-    if distance_m > FARTHEST_M:
+    if distance_m > tuned.FARTHEST_M:
         raise CalibrationError(f"the camera would be {distance_m:.1f} m away: {_ADVICE}")
 
 
 def _warnings(samples: Samples, refined: Refinement, off: Residuals, spread: Diversity) -> list[str]:
     out = []
-    if len(samples) < GOOD_POSES:
-        out.append(f"{len(samples)} poses: {GOOD_POSES} to 20 well spread ones are worth their time")
+    if len(samples) < tuned.GOOD_POSES:
+        out.append(f"{len(samples)} poses: {tuned.GOOD_POSES} to 20 well spread ones are worth their time")
     if spread.half_turns:
         out.append(
             f"{spread.half_turns} of {spread.motions} motions turn by nearly 180 degrees, which upsets Tsai-Lenz"
         )
     median_mm, median_deg = off.medians
-    if median_mm > LARGE_RESIDUAL_MM or median_deg > LARGE_RESIDUAL_DEG:
+    if median_mm > tuned.LARGE_RESIDUAL_MM or median_deg > tuned.LARGE_RESIDUAL_DEG:
         out.append(f"residuals are large ({median_mm:.1f} mm, {median_deg:.1f} degrees in the median): {_ADVICE}")
-    noticed = [i for i in refined.outliers if off.mm[i] > NOTABLE_MM or off.deg[i] > NOTABLE_DEG]
-    for i in noticed[:WARNED_OUTLIERS]:
+    noticed = [i for i in refined.outliers if off.mm[i] > tuned.NOTABLE_MM or off.deg[i] > tuned.NOTABLE_DEG]
+    for i in noticed[: tuned.WARNED_OUTLIERS]:
         out.append(
             f"{samples.name(i)} does not fit the others (off by {off.mm[i]:.1f} mm, {off.deg[i]:.2f} "
             f"degrees) and counts for {refined.weights[i]:.2f}"

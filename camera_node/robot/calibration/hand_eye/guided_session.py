@@ -18,6 +18,7 @@ import numpy as np
 
 from camera_node.robot.arm.camera_poses import base_matrix
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import tuned_numbers as tuned
 from camera_node.robot.calibration.hand_eye.refinement import refine
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,
@@ -28,16 +29,6 @@ from camera_node.robot.calibration.hand_eye.samples import (
     rotation_vectors,
 )
 from camera_node.robot.calibration.targets import WHICH_PRINT, Target, estimate_pose, to_gray
-from camera_node.robot.calibration.tuned_numbers import (
-    EXPLAIN_EVERY,
-    GOOD_MM,
-    GOOD_POSES,
-    GOOD_SPREAD_DEG,
-    MIN_TO_SOLVE,
-    NEW_DEG,
-    STILL_DEG,
-    STILL_MM,
-)
 from camera_node.settings import ArmConfig, source_config
 from camera_node.sources.base import Source, pixels
 from camera_node.sources.devices.feed import Image
@@ -139,19 +130,19 @@ class HandEyeSession:
     def offer(self, image: Image, lens: Pinhole, flange: Array) -> Step:
         """Process an image (H, W) or (H, W, 3) taken with the flange at ``flange`` (4, 4), in base."""
         last, self._last = self._last, flange
-        if last is None or distance_mm(last, flange) > STILL_MM or angle_deg(last, flange) > STILL_DEG:
+        if last is None or distance_mm(last, flange) > tuned.STILL_MM or angle_deg(last, flange) > tuned.STILL_DEG:
             return self._step("arm moving", "hold still")
         gray = to_gray(image)
         corners = self._target.find(gray)
         if corners is None:
             self._missed += 1
-            if self._missed % EXPLAIN_EVERY == 1:  # it takes a second
+            if self._missed % tuned.EXPLAIN_EVERY == 1:  # it takes a second
                 self._why = self._target.explain(gray)
             return self._step("target not found", self._why or "bring all of it into the picture, well lit")
         if not self._target.decided():
             return self._step("target unclear", WHICH_PRINT)
         turned_deg = angle_deg(self.samples.flange, flange)
-        if len(turned_deg) and turned_deg.min() < NEW_DEG:
+        if len(turned_deg) and turned_deg.min() < tuned.NEW_DEG:
             return self._step(f"like pose {int(np.argmin(turned_deg)) + 1}")
         try:
             seen = estimate_pose(corners, lens)
@@ -162,7 +153,7 @@ class HandEyeSession:
         self.samples = replace(self.samples, flange=flanges, target=targets)
         found = diversity(self.samples)
         self._spread_deg = found.axis_spread_deg
-        if found.reason is None and len(self.samples) >= MIN_TO_SOLVE:
+        if found.reason is None and len(self.samples) >= tuned.MIN_TO_SOLVE:
             self._std_mm = refine(self.samples).std_mm
         return self._step(KEPT)
 
@@ -170,8 +161,8 @@ class HandEyeSession:
         progress = f"{len(self.samples)} poses, axes spread by {self._spread_deg:.0f} degrees"
         if np.isfinite(self._std_mm):
             progress += f", sure to {self._std_mm:.2f} mm"
-        varied = len(self.samples) >= GOOD_POSES and self._spread_deg >= GOOD_SPREAD_DEG
-        enough = varied and self._std_mm <= GOOD_MM
+        varied = len(self.samples) >= tuned.GOOD_POSES and self._spread_deg >= tuned.GOOD_SPREAD_DEG
+        enough = varied and self._std_mm <= tuned.GOOD_MM
         return Step(outcome, progress, advice or ("enough" if enough else missing_turn(self.samples.flange)), enough)
 
 

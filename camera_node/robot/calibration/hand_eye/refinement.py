@@ -21,18 +21,9 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
+from camera_node.robot.calibration import tuned_numbers as tuned
 from camera_node.robot.calibration.hand_eye.closed_form import start as closed_form_start
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, rotation_vectors
-from camera_node.robot.calibration.tuned_numbers import (
-    DEGREES_OF_FREEDOM,
-    MIN_NOISE,
-    NOISE_SETTLED,
-    NOISE_STEPS,
-    OUTLIER_WEIGHT,
-    ROUNDS,
-    SETTLED,
-    SMALLEST_LIKELIHOOD_GAIN,
-)
 from freshfield.geometry import se3, se3_inverse
 
 
@@ -59,7 +50,7 @@ class Refinement:
 
     @property
     def outliers(self) -> list[int]:
-        return [int(i) for i in np.flatnonzero(self.weights < OUTLIER_WEIGHT)]
+        return [int(i) for i in np.flatnonzero(self.weights < tuned.OUTLIER_WEIGHT)]
 
 
 def refine(samples: Samples, with_scale: bool = False) -> Refinement:
@@ -72,20 +63,20 @@ def refine(samples: Samples, with_scale: bool = False) -> Refinement:
         return flange_residuals(seen, _retract(x, step[:6]), _retract(y, step[6:12]))
 
     noise = _robust_scale(residuals(start))
-    for _ in range(ROUNDS):
+    for _ in range(tuned.ROUNDS):
         widths = np.repeat(noise, 3)
         solved = least_squares(
             lambda step, widths=widths: (residuals(step) / widths).ravel(),
             start,
             x_scale="jac",
             loss=_student_t,
-            ftol=SMALLEST_LIKELIHOOD_GAIN,
+            ftol=tuned.SMALLEST_LIKELIHOOD_GAIN,
         )
         e = residuals(solved.x)
         x, y = _retract(x, solved.x[:6]), _retract(y, solved.x[6:12])
         scale *= float(np.exp(solved.x[12])) if with_scale else 1.0
         before, noise = noise, _noise(e, noise)
-        if np.abs(noise / before - 1.0).max() < SETTLED:
+        if np.abs(noise / before - 1.0).max() < tuned.SETTLED:
             break
     covariance = np.linalg.pinv(solved.jac.T @ solved.jac, hermitian=True)
     turn, shift = (float(np.sqrt(np.trace(covariance[k : k + 3, k : k + 3]))) for k in (0, 3))
@@ -114,15 +105,15 @@ def _student_t(squares: Array) -> Array:
     """scipy's loss (3, 6 N) for squared whitened residuals (6 N,): its value, of which each of a sample's six
     numbers has a sixth, and its slope, which is the sample's weight. The second derivative is taken as 0."""
     total = squares.reshape(-1, 6).sum(axis=1)
-    value = (DEGREES_OF_FREEDOM + 6.0) * np.log1p(total / DEGREES_OF_FREEDOM) / 6.0
-    slope = (DEGREES_OF_FREEDOM + 6.0) / (DEGREES_OF_FREEDOM + total)
+    value = (tuned.DEGREES_OF_FREEDOM + 6.0) * np.log1p(total / tuned.DEGREES_OF_FREEDOM) / 6.0
+    slope = (tuned.DEGREES_OF_FREEDOM + 6.0) / (tuned.DEGREES_OF_FREEDOM + total)
     return np.stack([np.repeat(value, 6), np.repeat(slope, 6), np.zeros(len(squares))])
 
 
 def _weights(e: Array, noise: Array) -> Array:
     """Weights (N,) of the samples under Student's t."""
     whitened = e / np.repeat(noise, 3)
-    return np.asarray((DEGREES_OF_FREEDOM + 6.0) / (DEGREES_OF_FREEDOM + (whitened**2).sum(axis=1)))
+    return np.asarray((tuned.DEGREES_OF_FREEDOM + 6.0) / (tuned.DEGREES_OF_FREEDOM + (whitened**2).sum(axis=1)))
 
 
 def _noise(e: Array, noise: Array) -> Array:
@@ -130,10 +121,10 @@ def _noise(e: Array, noise: Array) -> Array:
     three coordinates a sample, six parameters are taken as fitted."""
     squares = (e**2).reshape(-1, 2, 3).sum(axis=2)
     freedom = max(3 * len(e) - 6, 1)
-    for _ in range(NOISE_STEPS):
+    for _ in range(tuned.NOISE_STEPS):
         before = noise
-        noise = np.maximum(np.sqrt(_weights(e, noise) @ squares / freedom), MIN_NOISE)
-        if np.abs(noise / before - 1.0).max() < NOISE_SETTLED:
+        noise = np.maximum(np.sqrt(_weights(e, noise) @ squares / freedom), tuned.MIN_NOISE)
+        if np.abs(noise / before - 1.0).max() < tuned.NOISE_SETTLED:
             break
     return noise
 
@@ -141,4 +132,4 @@ def _noise(e: Array, noise: Array) -> Array:
 def _robust_scale(e: Array) -> Array:
     """Robust first estimate of the arm's noise (rad, m), by median absolute deviation."""
     scale = [1.4826 * float(np.median(np.abs(part))) for part in (e[:, :3], e[:, 3:])]
-    return np.maximum(scale, MIN_NOISE)
+    return np.maximum(scale, tuned.MIN_NOISE)

@@ -15,13 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration.tuned_numbers import (
-    HALF_TURN_MARGIN_DEG,
-    MAX_SAMPLES,
-    MIN_POSES,
-    MIN_SPREAD_DEG,
-    MIN_TURN_DEG,
-)
+from camera_node.robot.calibration import tuned_numbers as tuned
 from freshfield.geometry import Array, se3_inverse
 
 
@@ -116,14 +110,14 @@ class Diversity:
 
 def diversity(samples: Samples) -> Diversity:
     """Examine the motions between all pairs of samples (of at most 80)."""
-    chosen = samples.subsample(MAX_SAMPLES)
+    chosen = samples.subsample(tuned.MAX_SAMPLES)
     if len(chosen) < 2:
         return Diversity(0, 0, 0.0, 0.0, _too_few(len(samples)))
     first, second = np.triu_indices(len(chosen), 1)
     rotation = chosen.moved[:, :3, :3]
     turns = rotation_vectors(np.swapaxes(rotation[first], 1, 2) @ rotation[second])
     angles_deg = np.degrees(np.linalg.norm(turns, axis=1))
-    small, half = angles_deg < MIN_TURN_DEG, angles_deg > 180.0 - HALF_TURN_MARGIN_DEG
+    small, half = angles_deg < tuned.MIN_TURN_DEG, angles_deg > 180.0 - tuned.HALF_TURN_MARGIN_DEG
     usable = ~small & ~half
     axes = turns[usable] / np.linalg.norm(turns[usable], axis=1, keepdims=True)
     # The mean of u u^T treats axes u and -u as one. Its second eigenvalue is sin^2 of the half angle of the
@@ -131,23 +125,23 @@ def diversity(samples: Samples) -> Diversity:
     values = np.linalg.eigh(axes.T @ axes / max(1, len(axes)))[0]
     spread_deg = float(np.degrees(np.arcsin(np.sqrt(np.clip(values[1], 0.0, 1.0)))))
     reason: str | None = None
-    if len(samples) < MIN_POSES:
+    if len(samples) < tuned.MIN_POSES:
         reason = _too_few(len(samples))
-    elif usable.sum() >= 2 and spread_deg < MIN_SPREAD_DEG:
+    elif usable.sum() >= 2 and spread_deg < tuned.MIN_SPREAD_DEG:
         reason = (
             f"the flange has turned about parallel axes only (they spread by {spread_deg:.1f} degrees, at least "
-            f"{MIN_SPREAD_DEG:g} are needed): the translation along them stays unknown; tilt it about another "
+            f"{tuned.MIN_SPREAD_DEG:g} are needed): the translation along them stays unknown; tilt it about another "
             "axis too"
         )
     elif usable.sum() < 2 and half.sum() >= small.sum():
         reason = "turns are near 180 degrees, where the axis' sign is lost; add poses turned by 20 to 90 degrees"
     elif usable.sum() < 2:
         reason = (
-            f"the flange has hardly turned (by {angles_deg.max():.1f} degrees at most, {MIN_TURN_DEG:g} are "
+            f"the flange has hardly turned (by {angles_deg.max():.1f} degrees at most, {tuned.MIN_TURN_DEG:g} are "
             "needed): moving without turning says nothing about the translation; turn it by 20 to 90 degrees"
         )
     return Diversity(len(angles_deg), int(half.sum()), float(angles_deg.max()), spread_deg, reason)
 
 
 def _too_few(count: int) -> str:
-    return f"too few poses: {count}, at least {MIN_POSES} are needed and 10 to 20 are good"
+    return f"too few poses: {count}, at least {tuned.MIN_POSES} are needed and 10 to 20 are good"

@@ -13,15 +13,8 @@ import cv2
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
+from camera_node.robot.calibration import tuned_numbers as tuned
 from camera_node.robot.calibration.targets import Array, Corners
-from camera_node.robot.calibration.tuned_numbers import (
-    DAMPING_FACTOR,
-    FIRST_DAMPING,
-    LAST_DAMPING,
-    MOST_STEPS,
-    ROBUST_PX,
-    SMALLEST_GAIN,
-)
 from freshfield.geometry import Pinhole, se3, so3_log
 
 _LENS = 8  # fx, fy, cx, cy, k1, k2, p1, p2, in the order of projectPoints' derivatives
@@ -100,32 +93,32 @@ def _minimize(problem: _Problem, start: Array) -> Array:
     These have a few hundred unknowns, however many corners were seen. scipy's solver for sparse problems does not come
     to an end here, and the one for dense ones takes a minute.
     """
-    values, damping = start, FIRST_DAMPING
+    values, damping = start, tuned.FIRST_DAMPING
     residuals = problem.residuals(values)
-    for _ in range(MOST_STEPS):
+    for _ in range(tuned.MOST_STEPS):
         jacobian = problem.jacobian(values)
-        weights = np.minimum(1.0, ROBUST_PX / np.maximum(np.abs(residuals), 1e-12))
+        weights = np.minimum(1.0, tuned.ROBUST_PX / np.maximum(np.abs(residuals), 1e-12))
         normal = (jacobian.T @ jacobian.multiply(weights[:, None])).toarray()
         gradient = jacobian.T @ (weights * residuals)
         before = _huber(residuals)
-        while damping < LAST_DAMPING:
+        while damping < tuned.LAST_DAMPING:
             stepped = values.copy()
             stepped[problem.free] -= np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
             tried = problem.residuals(stepped)
             if (loss := _huber(tried)) < before:
                 break
-            damping *= DAMPING_FACTOR
+            damping *= tuned.DAMPING_FACTOR
         else:
             break
-        values, residuals, damping = stepped, tried, damping / DAMPING_FACTOR
-        if before - loss < SMALLEST_GAIN * before:
+        values, residuals, damping = stepped, tried, damping / tuned.DAMPING_FACTOR
+        if before - loss < tuned.SMALLEST_GAIN * before:
             break
     return values
 
 
 def _huber(residuals: Array) -> float:
     size = np.abs(residuals)
-    return float(np.where(size < ROBUST_PX, size**2, ROBUST_PX * (2 * size - ROBUST_PX)).sum())
+    return float(np.where(size < tuned.ROBUST_PX, size**2, tuned.ROBUST_PX * (2 * size - tuned.ROBUST_PX)).sum())
 
 
 @dataclass(frozen=True)
