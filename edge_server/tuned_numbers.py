@@ -27,14 +27,3 @@ DEPTH_MOST_ASPECT = 2.5  # of the depth network's input: attention's memory grow
 # --- the foreground's detector (foreground) ---
 NMS_IOU = 0.6
 NMS_BOXES = 300  # that enter non-maximum suppression, by score
-
-# --- which pixels move (fidelity.moving_pixels) ---
-MOVING_LAGS_MS = (60.0, 120.0, 200.0, 300.0)
-MOVING_BOUND = 0.03
-MOVING_NOISE_SIGMAS = 4.0
-# No usable camera is noisier; a larger estimate means that the camera itself moves.
-NOISE_LIMIT = 0.05
-NOISE_PAIRS = 32  # newest pairs of frames from which noise is estimated
-
-# --- a moving held-out camera's frames so far (fidelity.so_far) ---
-SO_FAR_FRAMES = 64  # at the end of a run each is rendered, 10 ms at 320 x 240

@@ -8,7 +8,7 @@ import pytest
 PROGRAMS = {
     "pytest": "import channel_emu.pytest_plugin",
     "edge": """
-import edge_server.page, edge_server.live.server, edge_server.report.build_report
+import edge_server.page, edge_server.live.server, edge_server.report.run_statistics
 import edge_server.experiments.virtual.from_scenario
 from edge_server.settings import read_config
 from freshfield.scenario import load

@@ -39,7 +39,7 @@ def add_commands(commands: Any) -> None:
         description="Moves the arm of a scenario along the viewpoints of its source.arm.path, there and "
         "back, until Ctrl-C. Prints the joint angles first, and asks before it moves a real arm.",
     )
-    drive.set_defaults(run=partial(_run, "arm.drive"))
+    drive.set_defaults(run=partial(_run, "arm.drive_tour"))
     add = drive.add_argument
     add("scenario", help="a scenario whose source.arm has a path")
     add("--rounds", type=int, default=0, metavar="N", help="number of tours; 0: until Ctrl-C [%(default)s]")

@@ -6,10 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fidelity.images import same_size, to_unit
-
-# PSNR of equal images: (3.31) is infinite there, and an infinity would spoil every mean. An error below 1e-10
-# of the squared range is far below the resolution of 8-bit images.
-PSNR_CEILING_DB = 100.0
+from edge_server.fidelity.tuned_numbers import PSNR_CEILING_DB
 
 
 def psnr_of_mse(mse: float) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import viser
 
 from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
-from edge_server.page import markup, views
+from edge_server.page import display_modes, markup
 from edge_server.page import tuned_numbers as tuned
 from edge_server.page.controls import ControlPanel
 from edge_server.page.diagnosis import poor_picture
@@ -134,7 +134,7 @@ class Panel:
         )
         rows, columns = comparison.truth.shape[:2]
         height = max(1, round(tuned.PAIR_PX / 2 * rows / columns))
-        pair = browser_image(views.compared(comparison, tuned.PAIR_PX, height, error=False, labeled=False))
+        pair = browser_image(display_modes.compared(comparison, tuned.PAIR_PX, height, error=False, labeled=False))
         if self._pair is None:
             order = self._caption.order + 0.5  # below its caption
             self._pair = self._gui.add_image(pair, format="jpeg", jpeg_quality=tuned.PAIR_JPEG_QUALITY, order=order)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, Snapshot
 from edge_server.live.state import Comparison, EdgeState
+from edge_server.page import display_modes
 from edge_server.page import tuned_numbers as tuned
-from edge_server.page import views
 from edge_server.page.page_thread import PageThread
 from edge_server.page.viewpoint import row_band, visitor_camera
 from freshfield.geometry import Pinhole
@@ -65,7 +65,7 @@ class ClientState:
     serial: number of viewpoints so far.
     level: the finest of LEVELS sent for this viewpoint and ``renderer``, -1 for none.
     sent: number of images since the last blank background.
-    view: what of the scene is shown, one of ``views.VIEWS``.
+    view: what of the scene is shown, one of ``display_modes.VIEWS``.
     """
 
     client: Any
@@ -75,7 +75,7 @@ class ClientState:
     renderer: Snapshot | Comparison | None = None
     level: int = -1
     sent: int = 0
-    view: str = views.PICTURE
+    view: str = display_modes.PICTURE
 
 
 class RenderLoop(PageThread):
@@ -101,7 +101,7 @@ class RenderLoop(PageThread):
             self._visitors.pop(client.client_id, None)
 
     def choose(self, client: Any, view: str) -> None:
-        """Show the client another of ``views.VIEWS`` from now on."""
+        """Show the client another of ``display_modes.VIEWS`` from now on."""
         with self._wake:
             visitor = self._visitors.get(client.client_id)
             if visitor is not None:
@@ -158,7 +158,7 @@ class RenderLoop(PageThread):
 
     def _compared(self, visitor: ClientState) -> Comparison | None:
         """What a visitor who looks at truth or error sees; None for another view, and before there is a truth."""
-        return self._state.comparison if visitor.view in (views.TRUTH, views.ERROR) else None
+        return self._state.comparison if visitor.view in (display_modes.TRUTH, display_modes.ERROR) else None
 
     def _next_level(self, visitor: ClientState, renderer: Snapshot | Comparison, now: float) -> int | None:
         """The level to render next for a visitor; None if it has the finest or must wait."""
@@ -183,8 +183,8 @@ class RenderLoop(PageThread):
         try:
             if isinstance(shown, Comparison):
                 _, camera = visitor_camera(*viewpoint, rows=LEVELS[-1].max_rows)
-                image: NDArray[np.float32] | None = views.compared(
-                    shown, camera.width, camera.height, visitor.view == views.ERROR
+                image: NDArray[np.float32] | None = display_modes.compared(
+                    shown, camera.width, camera.height, visitor.view == display_modes.ERROR
                 )
                 # A visitor who drags sees it anew, as one who moves; nothing finer will follow.
                 level, levels = len(LEVELS) - 1, [MOVING, NEWER]
@@ -216,10 +216,10 @@ class RenderLoop(PageThread):
         if rendering is None:
             return None
         self._adapt(level, perf_counter() - began)
-        if visitor.view == views.DEPTH:
-            return views.depth_view(rendering)
-        if visitor.view == views.AGE:
-            return views.age_view(rendering, pose, camera, self._state.cameras())
+        if visitor.view == display_modes.DEPTH:
+            return display_modes.depth_view(rendering)
+        if visitor.view == display_modes.AGE:
+            return display_modes.age_view(rendering, pose, camera, self._state.cameras())
         if level and isinstance(shown, TellsUnseen):
             return hatched(rendering.color, shown.unseen(pose, camera.scaled(1.0 / tuned.UNSEEN_COARSE)))
         return rendering.color
@@ -270,7 +270,7 @@ def hatched(image: NDArray[np.float32], unseen: NDArray[np.bool_] | None) -> NDA
 def browser_image(color: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Color (H, W, 3) as uint8; pixels that are not finite show the backdrop."""
     good = np.isfinite(color).all(axis=-1, keepdims=True)
-    return (np.clip(np.where(good, color, views.BACKDROP), 0, 1) * 255 + 0.5).astype(np.uint8)
+    return (np.clip(np.where(good, color, display_modes.BACKDROP), 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _same(a: tuple | None, b: tuple) -> bool:

@@ -13,6 +13,7 @@ import yaml
 import camera_node.cli
 import channel_emu.cli
 import edge_server.cli
+import edge_server.run_command
 from edge_server.live.keys_command import make_keys
 from freshfield.scenario import load
 from tests.conftest import ROOT
@@ -106,7 +107,8 @@ def test_a_pod_for_each_camera_and_commands_that_their_programs_take(monkeypatch
         (container,) = template["spec"]["containers"]
         program, *words = (re.sub(r"\$\(\w+\)", lambda found: last[found[0]], word) for word in container["command"])
         taken = []
-        monkeypatch.setattr(CLI[program], "_run", lambda args, taken=taken: taken.append(args) or 0)
+        runs = edge_server.run_command if program == "edge-server" else CLI[program]
+        monkeypatch.setattr(runs, "_run", lambda args, taken=taken: taken.append(args) or 0)
         assert CLI[program].main(words) == 0 and taken[0].scenario == scene, name
         if name == "camera":
             assert camera_node.cli._chosen(load(scene), taken[0]) == (cameras[-1],)

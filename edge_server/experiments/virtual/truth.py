@@ -17,8 +17,8 @@ from edge_server.experiments.tuned_numbers import NOISE_FRAMES
 from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
+from edge_server.fidelity.tuned_numbers import MOVING_BOUND, MOVING_LAGS_MS
 from edge_server.fields import View
-from edge_server.tuned_numbers import MOVING_BOUND, MOVING_LAGS_MS
 from freshfield import payload
 from freshfield.geometry import Pinhole
 

@@ -19,10 +19,10 @@ from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import FrameScore, score_frame, stays
+from edge_server.fidelity.tuned_numbers import MOVING_BOUND, MOVING_LAGS_MS
 from edge_server.fields import Snapshot, View
 from edge_server.live import tuned_numbers as tuned
 from edge_server.live.state import Publication
-from edge_server.tuned_numbers import MOVING_BOUND, MOVING_LAGS_MS
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pose

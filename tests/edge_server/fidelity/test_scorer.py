@@ -16,12 +16,12 @@ from edge_server.fidelity.fetch_lpips import FetchError, convert
 from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips, weights_folder
 from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags, moving_mask
-from edge_server.fidelity.psnr import PSNR_CEILING_DB, psnr
+from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.scorer import Scorer, mean_score
 from edge_server.fidelity.ssim import ssim
+from edge_server.fidelity.tuned_numbers import MOVING_BOUND, PSNR_CEILING_DB
 from edge_server.fields import View
 from edge_server.run_records import Baseline
-from edge_server.tuned_numbers import MOVING_BOUND
 from freshfield.geometry import Pinhole, look_at
 from tests.conftest import data_dir
 from tests.support import refusal, refused

@@ -15,7 +15,7 @@ from edge_server.fidelity.scorer import Score
 from edge_server.fields import Rendering
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.live.state import CameraView, Comparison, EdgeState
-from edge_server.page import PageError, panel, start_page, views
+from edge_server.page import PageError, display_modes, panel, start_page
 from edge_server.page.controls import ControlPanel
 from edge_server.page.rendering import LEVELS, MOVING, NEWER, ClientState, RenderLoop, browser_image, hatched
 from edge_server.page.scene import Scene, thumbnail
@@ -210,7 +210,7 @@ def test_nothing_is_rendered_without_visitors_and_one_who_moves_by_a_millimeter_
 def test_who_looks_at_truth_gets_each_comparison_once_and_the_picture_before_there_is_one():
     state = bare_state()
     loop = RenderLoop(state)
-    loop.choose(client := shown_to(loop), views.TRUTH)
+    loop.choose(client := shown_to(loop), display_modes.TRUTH)
     sent = client.scene.set_background_image
     state.publish(publication(0), BallScene(0.0))
     assert loop._work(1e9) and sent.call_count == 1
@@ -219,7 +219,7 @@ def test_who_looks_at_truth_gets_each_comparison_once_and_the_picture_before_the
         state.scored(publication(0), Comparison("cam00", truth, truth, number))
         assert loop._work(1e9 * number + 1e9) and not loop._work(1e9 * number + 2e9)
         assert sent.call_count == 1 + number and (sent.call_args.args[0] == 200).mean() > 0.2
-    loop.choose(client, views.PICTURE)
+    loop.choose(client, display_modes.PICTURE)
     assert loop._work(9e9) and (sent.call_args.args[0] == 200).mean() < 0.2
 
 

@@ -23,7 +23,7 @@ from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.simulate import digest, main
 from edge_server.experiments.virtual.try_policy import try_policy
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
-from edge_server.report.build_report import build_report
+from edge_server.report.run_statistics import build_report
 from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.settings import Spec

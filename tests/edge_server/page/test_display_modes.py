@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison
-from edge_server.page import colors, views
+from edge_server.page import colors, display_modes
 from edge_server.page.colors import FRESH, MIDDLE, STALE, UNKNOWN, age_color, age_colors
 from edge_server.page.tuned_numbers import FRESH_MS, STALE_MS
 from edge_server.page.viewpoint import initial_viewpoint, row_band, visitor_camera
@@ -34,11 +34,11 @@ def test_near_is_red_and_far_is_blue():
     rendering.depth[:, :32] = 2.0
     rendering.depth[:8] = 0.0  # empty
     rendering.depth[8, 0] = np.nan
-    image = views.depth_view(rendering)
+    image = display_modes.depth_view(rendering)
     assert image.dtype == np.float32 and np.isfinite(image).all()
     assert image[20, 5, 0] > 2 * image[20, 5, 2] and image[20, 60, 2] > image[20, 60, 0]
-    assert (image[4] == views.BACKDROP).all() and (image[8, 0] == views.BACKDROP).all()
-    assert (views.depth_view(replace(rendering, opacity=0 * rendering.opacity)) == views.BACKDROP).all()
+    assert (image[4] == display_modes.BACKDROP).all() and (image[8, 0] == display_modes.BACKDROP).all()
+    assert (display_modes.depth_view(replace(rendering, opacity=0 * rendering.opacity)) == display_modes.BACKDROP).all()
 
 
 def test_each_place_has_the_age_of_the_newest_frame_that_looks_at_it():
@@ -49,27 +49,27 @@ def test_each_place_has_the_age_of_the_newest_frame_that_looks_at_it():
     cameras = [camera("old", 0.0, 5000.0), camera("new", 2.3, 20.0), camera("truth", 0.0, 1.0, held_out=True)]
     rendering = flat()
     rendering.depth[:8], rendering.opacity[:8] = 0.01, 0.0  # empty
-    image = views.age_view(rendering, FRONT, LENS, [*cameras, CameraView("never", False, None, None, 0, 0)])
-    light = views.AGE_VIEW_LIGHT + (1 - views.AGE_VIEW_LIGHT) * 0.5
+    image = display_modes.age_view(rendering, FRONT, LENS, [*cameras, CameraView("never", False, None, None, 0, 0)])
+    light = display_modes.AGE_VIEW_LIGHT + (1 - display_modes.AGE_VIEW_LIGHT) * 0.5
     assert image[24, 4] / light * 255 == pytest.approx(STALE, abs=2)
     assert image[24, 60] / light * 255 == pytest.approx(FRESH, abs=2)
     assert image[2, 30] / light * 255 == pytest.approx(UNKNOWN, abs=2)
-    assert views.age_view(flat(), FRONT, LENS, [])[24, 30] / light * 255 == pytest.approx(UNKNOWN, abs=2)
+    assert display_modes.age_view(flat(), FRONT, LENS, [])[24, 30] / light * 255 == pytest.approx(UNKNOWN, abs=2)
 
 
 @pytest.mark.parametrize(("size", "beside"), [((640, 200), True), ((300, 600), False)])
 def test_truth_and_rendering_are_as_large_as_they_fit(size, beside):
     truth, rendered = np.full((48, 64, 3), 200, np.uint8), np.full((24, 32, 3), 195, np.uint8)
     comparison = Comparison("cam00", truth, rendered, 3)
-    image = views.compared(comparison, *size, error=False)
+    image = display_modes.compared(comparison, *size, error=False)
     assert image.shape == (size[1], size[0], 3)
-    shown = (image != views.BACKDROP).all(axis=2)
+    shown = (image != display_modes.BACKDROP).all(axis=2)
     assert shown.any(axis=0).sum() > 0.8 * size[0] or shown.any(axis=1).sum() > 0.8 * size[1]
     first = image[:, : size[0] // 2] if beside else image[: size[1] // 2]
-    assert np.median(first[(first != views.BACKDROP).all(axis=2)]) == pytest.approx(200 / 255)
+    assert np.median(first[(first != display_modes.BACKDROP).all(axis=2)]) == pytest.approx(200 / 255)
     second = image[:, size[0] // 2 :] if beside else image[size[1] // 2 :]
     assert first.max() == second.max() == 1.0, "both are labeled"
-    error = views.compared(comparison, *size, error=True)
+    error = display_modes.compared(comparison, *size, error=True)
     assert error[size[1] // 2, size[0] // 2] == pytest.approx(4 * 5 / 255, abs=1e-3)
 
 
