@@ -25,7 +25,7 @@ FAST = {"contract", "reassoc", "arcp", "nsz"}
 def cache_folder(root: Path) -> Path:
     """Where compiled kernels are kept: a folder in $NUMBA_CACHE_DIR, or in the user's cache, for each state of
     the sources. numba checks only the file that a function stands in, but kernels inline functions of others, and
-    numbers of settings.
+    numbers of ``settings`` and ``tuned_numbers``.
 
     root: the package whose folders called ``kernels`` count.
     """
