@@ -17,7 +17,7 @@ from edge_server.experiments.studies.learning import (
 )
 from edge_server.experiments.studies.study import Study, StudyRequest
 from edge_server.experiments.studies.verdicts import Claim, Statistic, better, better_than_all
-from edge_server.scheduler.learned.settings import Action
+from edge_server.scheduler.learned.learner_spec import Action
 
 LEARNED, RANDOM, ALL = {"policy": "learned"}, {"policy": "random"}, {"policy": "all"}
 THRESHOLD, WAIT = ({"policy": p, "best": "value"} for p in ("threshold", "wait"))

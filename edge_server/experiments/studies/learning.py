@@ -23,7 +23,7 @@ from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
 from edge_server.experiments.tuned_numbers import OMEGAS_MS, QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.scheduler.learned.actor import Actor
-from edge_server.scheduler.learned.settings import Action, Spec
+from edge_server.scheduler.learned.learner_spec import Action, Spec
 
 SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")

@@ -31,8 +31,8 @@ from edge_server.experiments.engine.content_key import processor
 from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
 from edge_server.experiments.rollouts.rollout import Run, embeddings_seen, run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.rewards import Reward, RewardTerms
-from edge_server.scheduler.learned.settings import Spec
 from freshfield.files import write_json, write_text
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned.settings import Spec
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import State
 from freshfield import limits
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from edge_server.scheduler.learned.settings import Spec
+from edge_server.scheduler.learned.learner_spec import Spec
 
 # Bounds exp: larger ratios are far outside the clip anyway.
 _MAX_LOG_RATIO = 20.0

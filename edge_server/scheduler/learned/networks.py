@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler.learned.settings import Spec
+from edge_server.scheduler.learned.learner_spec import Spec
 
 Weights = dict[str, Any]
 """Name -> numpy array or torch tensor."""

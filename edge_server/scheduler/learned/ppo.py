@@ -31,7 +31,7 @@ from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned import tuned_numbers as tuned
 from edge_server.scheduler.learned.actor import KIND, Actor, read_spec
 from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
-from edge_server.scheduler.learned.settings import Spec
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.torch_threads import one_torch_thread
 from freshfield import limits
 

@@ -13,7 +13,7 @@ FEATURE_LIMIT = 8.0
 # A feature that hardly varied where it was standardized says nothing; scaling must not turn it into noise.
 MIN_SPREAD = 1e-3
 
-# --- learning (``Spec`` in settings, ppo) ---
+# --- learning (learner_spec, ppo) ---
 HIDDEN = 64  # width of all layers
 LEARNING_RATE, MINIBATCH, MAX_GRADIENT = 3e-3, 64, 0.5  # of Adam's steps; bound of the gradient's norm
 CLIP = 0.2  # epsilon of (5.23): probability ratios are clipped to 1 - epsilon ... 1 + epsilon

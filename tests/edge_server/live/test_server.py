@@ -28,8 +28,8 @@ from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.live.tuned_numbers import MAX_SNAPSHOTS, STOP_S
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision_record import read_decision
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.networks import init_actor
-from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import read_config
 from edge_server.tuned_numbers import SCAN

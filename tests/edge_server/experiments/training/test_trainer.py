@@ -16,9 +16,9 @@ from edge_server.experiments.training.evaluation import Candidate, Evaluation
 from edge_server.experiments.training.train_command import main
 from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, sibling_advantages, train
 from edge_server.scheduler import make_policy
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
 from edge_server.scheduler.learned.rewards import Reward, make_reward
-from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.experiments.rollouts.small import NOTHING, RAW, setting
 from tests.edge_server.scheduler.learned.problems import same

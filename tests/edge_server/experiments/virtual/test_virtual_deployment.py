@@ -25,8 +25,8 @@ from edge_server.experiments.virtual.try_policy import try_policy
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.report.run_statistics import build_report
 from edge_server.scheduler.learned.decision_record import read_decision
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
-from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import ComputeConfig, read_config
 from freshfield.frame import to_request

@@ -16,8 +16,8 @@ from edge_server.scheduler.learned import tuned_numbers as tuned
 from edge_server.scheduler.learned.actor import Decision
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision_record import FOLDER, DecisionWriter, read_decision
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
-from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.settings import read_config
 from freshfield import scenario

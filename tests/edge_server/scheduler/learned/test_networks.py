@@ -12,8 +12,8 @@ from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.distributions import most_probable_set, sample_sets, set_log_probability
 from edge_server.scheduler.learned.explain import action_logit, explain
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
-from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import StateLayout
 from tests.edge_server.scheduler.learned.problems import OMEGAS_MS, state
 from tests.support import refused

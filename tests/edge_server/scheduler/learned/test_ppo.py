@@ -14,8 +14,8 @@ from edge_server.scheduler.learned import distributions as d
 from edge_server.scheduler.learned import networks, ppo
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
+from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Diagnostics, Learner, _RunningMeanStd
-from edge_server.scheduler.learned.settings import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
 from freshfield import limits
 from tests.edge_server.scheduler.learned import problems
