@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from edge_server import tuned_numbers as tuned
 from edge_server.fields.registry import FIELD
+from edge_server.fields.splat.carried_camera.tuned_numbers import LIVE_OPTIONS
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.limits import LONGEST_MS
 from freshfield.scenario import Scenario
@@ -124,7 +125,7 @@ def with_defaults(section: Mapping[str, Any], moving: bool, cameras: int) -> dic
         found["field_options"] = options = {**options, "layers": True}
     layers = bool(options.get("layers"))
     if usual and moving and not layers and cameras <= tuned.MOST_CARRIED and "keyframes" not in found:
-        found["field_options"] = {**tuned.SCAN, **options}
+        found["field_options"] = {**LIVE_OPTIONS, **options}
         return {**tuned.CARRIED, **found}
     if moving and not layers:
         found.setdefault("keyframes", {})

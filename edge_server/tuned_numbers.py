@@ -12,8 +12,6 @@ CYCLE: dict[str, Any] = {"updates": "cycle", "update_ms": 800.0, "steps": 100}
 CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 80.0, "steps": 8}
 # Cameras: photos that are dealt to twelve (``fox``) are no tracks, and read 8 dB less as a scan (19 against 27).
 MOST_CARRIED = 4
-# Options of ``splat`` for that; few pixels bound the Gaussians further.
-SCAN: dict[str, Any] = {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
 
 # --- how far a command is (progress) ---
 LONG_WORK_S = 10.0  # of a stage of a command that is announced in a pipe, too: nobody wonders about less

@@ -67,13 +67,6 @@ INSTANT_GRID_MS = 10
 200, 300 ms), so that evaluations share renderings."""
 TRUTHS_KEPT = 8192
 """Renderings of held-out cameras kept in memory."""
-WAITS_MS = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0)
-OMEGAS_MS = {
-    "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
-    "wait": WAITS_MS,
-    "wait-arrived": WAITS_MS,
-}
-"""That thresholds and waits are chosen from."""
 TRAINING_STEPS, SCRATCH_STEPS = 20, 50
 """Optimizer steps of an update, and of one that starts with an empty field."""
 

@@ -17,14 +17,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.folders import folders_from
 from edge_server.experiments.rollouts.episode import Episode, EpisodeFactory, mean_outcome
 from edge_server.experiments.rollouts.rollout import choose
 from edge_server.experiments.rollouts.setting import Setting, layout_of, reward_of
 from edge_server.scheduler import Policy
 from edge_server.scheduler.fixed import freshest
-from edge_server.scheduler.learned.tuned_numbers import FEATURE_LIMIT
+from edge_server.scheduler.learned.tuned_numbers import FEATURE_LIMIT, OMEGAS_MS
 from edge_server.scheduler.policy import Epoch, SelectionWindow
 from edge_server.scheduler.wait import Wait
 from edge_server.settings import read_config
@@ -145,7 +144,7 @@ class WaitEnv(DecisionEnv):
     reward_name = "corrected"
 
     def __init__(
-        self, scenario: str | Path = "room", *, omegas_ms: tuple[float, ...] = tuned.OMEGAS_MS["wait"], **arguments: Any
+        self, scenario: str | Path = "room", *, omegas_ms: tuple[float, ...] = OMEGAS_MS["wait"], **arguments: Any
     ) -> None:
         """omegas_ms: waits to choose from. The others as ``DecisionEnv``."""
         super().__init__(scenario, **arguments)

@@ -21,9 +21,10 @@ from edge_server.experiments.studies.tuned_numbers import TRAININGS
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
 from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
-from edge_server.experiments.tuned_numbers import OMEGAS_MS, QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
+from edge_server.experiments.tuned_numbers import QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import Action, Spec
+from edge_server.scheduler.learned.tuned_numbers import OMEGAS_MS
 
 SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")

@@ -8,6 +8,16 @@ from __future__ import annotations
 LEAST_DB = 0.1
 """Smallest difference that supports a claim."""
 
+PLATEAU_NEAR = {
+    "psnr_db": 0.3,
+    "psnr_moving_db": 0.3,
+    "shown_psnr_db": 0.3,
+    "shown_psnr_moving_db": 0.3,
+    "ssim": 0.01,
+    "lpips": 0.01,
+}
+"""A curve is on its plateau if it is this near to its best value."""
+
 TRIAL_FPS = 100 / 3
 """Of synthetic scenes: the thesis's capture period of 30 ms."""
 

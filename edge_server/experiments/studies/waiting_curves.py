@@ -8,6 +8,7 @@ from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.studies.drawing import curves, instants
 from edge_server.experiments.studies.study import Study, StudyRequest
 from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep, usual_trial
+from edge_server.experiments.studies.tuned_numbers import PLATEAU_NEAR
 from edge_server.experiments.studies.verdicts import Claim, better, interior, plateau, trend
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)
@@ -25,15 +26,6 @@ CHANNELS: dict[str, Row] = {
 WAITS = ("wait", "wait-arrived", "wait-flush")
 # Where the plateau of wait starts in the thesis (6.5.2): 62 ms in high traffic, 105 ms in low.
 PLATEAU_MS = {"high traffic": 62.0, "low traffic": 105.0, "high traffic, parallel": 62.0}
-# A curve is on its plateau if it is this near to its best value.
-NEAR = {
-    "psnr_db": 0.3,
-    "psnr_moving_db": 0.3,
-    "shown_psnr_db": 0.3,
-    "shown_psnr_moving_db": 0.3,
-    "ssim": 0.01,
-    "lpips": 0.01,
-}
 FRESHNESS = ("f_w", "f_w_corrected")
 SHOWN = (30.0, 60.0, 120.0)
 BEST_OMEGA = {"best": "omega_ms"}
@@ -60,7 +52,7 @@ OMEGA = Study(
     "Threshold and wait against omega, by traffic and queue (figures 6.3, 6.4)",
     _omega_cases,
     run_points,
-    (*NEAR, *FRESHNESS),
+    (*PLATEAU_NEAR, *FRESHNESS),
     (
         Claim(
             "there is an optimum between few and stale views (6.5.1: at 50 ms in high traffic, 72 in low).",
@@ -75,9 +67,9 @@ OMEGA = Study(
                 Claim(
                     "waiting longer brings fidelity to a plateau, from 62 ms on in high traffic, 105 in low (6.5.2).",
                     _plateau,
-                    {metric: -near for metric, near in NEAR.items()},
+                    {metric: -near for metric, near in PLATEAU_NEAR.items()},
                     {"policy": policy},
-                    tuple(NEAR),
+                    tuple(PLATEAU_NEAR),
                 ),
                 Claim(
                     "has an optimum inside once freshness counts (6.5.2).",
@@ -101,7 +93,7 @@ OMEGA = Study(
     ),
     ("scene", "channel"),
     (
-        curves("omega", "omega_ms", "omega (ms)", (*NEAR, *FRESHNESS), "policy", ("scene", "channel")),
+        curves("omega", "omega_ms", "omega (ms)", (*PLATEAU_NEAR, *FRESHNESS), "policy", ("scene", "channel")),
         *(
             instants(f"omega-{policy}", ("room", "kitchen"), policy, SHOWN, {"preset": "ch6-high"}, every_ms=2400.0)
             for policy in ("threshold", "wait")

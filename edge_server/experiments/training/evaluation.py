@@ -17,9 +17,10 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.tuned_numbers import FITS, OMEGAS_MS
+from edge_server.experiments.tuned_numbers import FITS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import Reward
+from edge_server.scheduler.learned.tuned_numbers import OMEGAS_MS
 
 At = tuple[int, int]
 """Seed of an episode and number of a decision."""

@@ -7,6 +7,14 @@ from __future__ import annotations
 W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
 SET_P, SET_S, SET_L = 0.02, 0.5, -1.0  # of (5.19), as 5.6.2 has them: PSNR per dB, SSIM, LPIPS
 
+# --- actions: thresholds and waits that are chosen from where a training is told none (learner_spec) ---
+WAITS_MS = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0)
+OMEGAS_MS = {
+    "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
+    "wait": WAITS_MS,
+    "wait-arrived": WAITS_MS,
+}
+
 # --- features of a state (state) ---
 # Features are clipped to this many standard deviations: what lies beyond is a broken value, not information.
 FEATURE_LIMIT = 8.0

@@ -23,6 +23,7 @@ from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
+from edge_server.fields.splat.carried_camera.tuned_numbers import LIVE_OPTIONS
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.live.tuned_numbers import MAX_SNAPSHOTS, STOP_S
@@ -32,7 +33,6 @@ from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.networks import init_actor
 from edge_server.scheduler.learned.state import StateLayout
 from edge_server.settings import read_config
-from edge_server.tuned_numbers import SCAN
 from freshfield import scenario
 from freshfield.frame import to_request
 from freshfield.geometry import Pose, look_at
@@ -195,7 +195,7 @@ def test_operators_see_and_change_a_running_server(serve):
 
 def test_a_camera_that_moves_begins_the_field_anew_as_a_scan_and_a_resumed_run_knows_it(serve, tmp_path):
     small = {"gaussians": 300, "start": 200, "seed_cells": 12}
-    for kind in ({"layers": True}, SCAN):  # compiling may take longer than the test waits for anything
+    for kind in ({"layers": True}, LIVE_OPTIONS):  # compiling may take longer than the test waits for anything
         make_field("splat", {**kind, **small}).warm_up()
     made = tiny_scenario(tmp_path, field="splat", field_options=small)
     run = serve(made)

@@ -11,6 +11,8 @@ POSITION_PX, COLOR = 0.2, 0.012  # lower than where things move: seeds lie on su
 DISSIMILARITY = 0.02  # weight of (1 - SSIM) / 2 in the loss; three times as much raises SSIM and costs PSNR
 
 # --- how many Gaussians ---
+# Options of a carried camera's field, live, where a scenario says nothing; few pixels bound the Gaussians further.
+LIVE_OPTIONS: dict[str, Any] = {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
 PER_PIXEL = 0.78  # of one image, at most; more cost time in every step, and sharpen little
 LEAST, MOST = 8192, 1 << 18  # whatever the images; the most take 60 MB, and steps of a tenth of a second
 NEAR_SHARE = 0.1  # of the cameras' distance to the scene: a near plane for cameras that are carried close to things
