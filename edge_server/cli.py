@@ -7,13 +7,9 @@ import importlib
 import logging
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from freshfield.scenario import ScenarioError
 from freshfield.transport import TransportError
-
-if TYPE_CHECKING:
-    pass
 
 DESCRIPTION = """\
 The edge server of freshfield: takes posed frames, keeps a radiance field up to date, shows and measures it.
@@ -79,14 +75,14 @@ _COMMANDS = {
         "experiments.training.train_command",
         "learn when to update the field and from which views, rewarded by real field fits",
     ),
-    "compare": ("experiments.compare", "compare what policies show in a scenario, over seeds, with intervals"),
+    "compare": ("experiments.compare_command", "compare what policies show in a scenario, over seeds, with intervals"),
     "simulate": (
-        "experiments.virtual.simulate",
+        "experiments.virtual.simulate_command",
         "run a scenario's whole deployment in virtual time, reproducible bit for bit",
     ),
     "warm-up": ("fields.warm_up_command", "compile a field's kernels, so that the first run starts at once"),
     "costs": (
-        "experiments.virtual.costs",
+        "experiments.virtual.costs_command",
         "measure the time that a scenario's updates take on this machine, for virtual time",
     ),
     "viewpoints": (
@@ -98,7 +94,10 @@ _COMMANDS = {
     "export": ("export.export_command", "write a run's mesh, splats, points and cameras as files for other programs"),
     "render": ("export.render_command", "render images and videos of a run from new viewpoints"),
     "keys": ("live.keys_command", "make a development CA, certificates and tokens for a scenario's processes"),
-    "fetch-lpips": ("fidelity.fetch_lpips", "fetch LPIPS weights with the public package and convert them for --lpips"),
+    "fetch-lpips": (
+        "fidelity.fetch_lpips_command",
+        "fetch LPIPS weights with the public package and convert them for --lpips",
+    ),
 }
 
 

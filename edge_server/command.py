@@ -13,13 +13,13 @@ def command_parser(prog: str, description: str) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(prog, description=description, formatter_class=raw)
 
 
-def run_command(
+def exit_status(
     prog: str,
     work: Callable[[], object],
     errors: type[Exception] | tuple[type[Exception], ...],
     stopped: str | None = None,
 ) -> int:
-    """Call ``work`` and return the command's exit status.
+    """Call ``work`` and return the exit status of the command.
 
     errors: exceptions that are printed in one line; the status is then 2.
     stopped: text that is printed after Ctrl-C, unless the KeyboardInterrupt has one of its own; the status is then

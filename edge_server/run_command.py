@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from edge_server.command import command_parser
+from edge_server.command import command_parser, exit_status
 from freshfield import transport
 from freshfield.files import out_file, out_folder
 from freshfield.scenario import ScenarioError, load
@@ -89,10 +89,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     run.add_argument("--seconds", type=float, metavar="S", help="end after S seconds [on Ctrl-C]")
     transport.add_arguments(run)
-    return _run(run.parse_args(argv))
+    args = run.parse_args(argv)
+    return exit_status(run.prog, lambda: _run(args), (ScenarioError, TransportError))
 
 
-def _run(args: argparse.Namespace) -> int:
+def _run(args: argparse.Namespace) -> None:
     from edge_server.fidelity.lpips_weights import weights_folder
     from edge_server.live.server import EdgeServer, ServerOptions
     from edge_server.scheduler import parse_policy
@@ -148,7 +149,6 @@ def _run(args: argparse.Namespace) -> int:
         timer.daemon = True
         timer.start()
     server.run()
-    return 0
 
 
 def _open_page(host: str, port: int, secure: transport.Transport, emulator: str | None, state: EdgeState) -> OpenPage:

@@ -1,4 +1,4 @@
-"""A scenario's processes on this machine: opened for the command, or run from a script.
+"""A scenario's processes on this machine, run from a script.
 
 with freshfield.deployment("room", seconds=60, out="runs/room") as run:
     print(run.page, run.status()["updates"])

@@ -1,4 +1,4 @@
-"""One run from start to report: starts, supervises and stops its processes, then reports."""
+"""One run from start to report: checks it, starts, supervises and stops its processes, then reports."""
 
 from __future__ import annotations
 

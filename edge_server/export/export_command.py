@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.export import ExportError
 from edge_server.export.exporter import KINDS, Exporter, check
 from edge_server.export.run_source import open_source
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     files = {kind: path for kind in KINDS if (path := getattr(args, kind)) is not None}
     if not files:
         parser.error(f"say what to write: {', '.join(f'--{kind}' for kind in KINDS)}")
-    return run_command(parser.prog, lambda: _export(args, files), (ExportError, SurfaceError))
+    return exit_status(parser.prog, lambda: _export(args, files), (ExportError, SurfaceError))
 
 
 def _parser() -> argparse.ArgumentParser:

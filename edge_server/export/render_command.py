@@ -11,7 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.export import ExportError
 from edge_server.export import tuned_numbers as tuned
 from edge_server.export.camera_paths import Step, lens, looking, orbit, read_nerfstudio, vertical_fov_deg
@@ -40,7 +40,7 @@ Files end in .png or .jpg (the first image of a path), or in .mp4.
 def main(argv: Sequence[str] | None = None, prog: str = "edge-server render") -> int:
     """Run the command; returns its exit status. prog: its name in usage and errors."""
     args = _parser(prog).parse_args(argv)
-    return run_command(prog, lambda: _render(args), ExportError)
+    return exit_status(prog, lambda: _render(args), ExportError)
 
 
 def _parser(prog: str) -> argparse.ArgumentParser:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.report import tuned_numbers as tuned
 from edge_server.report.style import BLUE, GRAY, VERMILION, figure
 from edge_server.scheduler.learned.decision_record import RecordedDecision, read_decision
@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--camera", metavar="NAME", help="camera whose image regions to explain [that with the largest share]"
     )
     args = parser.parse_args(argv)
-    return run_command(parser.prog, lambda: _explain(args), ValueError)
+    return exit_status(parser.prog, lambda: _explain(args), ValueError)
 
 
 def _explain(args: argparse.Namespace) -> None:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge_server.command import command_parser
+from edge_server.command import command_parser, exit_status
 from freshfield.scenario import ScenarioError
 
 
@@ -17,11 +17,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     report.add_argument("directory", type=Path, metavar="DIR", help="folder of a run or fit (its --out)")
     report.add_argument("--beside", type=Path, metavar="DIR", help="print its figures beside those of this other run")
-    return _report(report.parse_args(argv))
+    args = report.parse_args(argv)
+    return exit_status(report.prog, lambda: _report(args), ScenarioError)
 
 
-def _report(args: argparse.Namespace) -> int:
-    from edge_server.report.run_statistics import build_report
+def _report(args: argparse.Namespace) -> None:
+    from edge_server.report.build_report import build_report
 
     runs = [args.directory] if args.beside is None else [args.directory, args.beside]
     left = ("ledger-*.tsv", "series.jsonl", "edge.json", "run.json")
@@ -36,4 +37,3 @@ def _report(args: argparse.Namespace) -> int:
 
         print(side_by_side({str(run): report for run, report in zip(runs, reports)}))
     print(args.directory / "report.html")
-    return 0

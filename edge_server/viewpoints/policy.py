@@ -40,7 +40,7 @@ class PolicyConfig:
     updates: number of updates. episodes: number of episodes for each update.
     way: cost of a way as long as the candidates' mean distance from the target, in standard deviations of
         the reward of a step: the same plan for a large scene as for a small one.
-    hidden, learning_rate: as in ``settings.Spec``.
+    hidden, learning_rate: as in ``learner_spec.Spec``.
     """
 
     views: int = 8

@@ -20,7 +20,7 @@ import pytest
 from camera_node.capture import Camera
 from edge_server.experiments.virtual.from_scenario import training_cameras
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.experiments.virtual.simulate import digest
+from edge_server.experiments.virtual.simulate_command import digest
 from edge_server.report.frame_accounting import FrameCounts, account_frames
 from edge_server.settings import ComputeConfig
 from freshfield.limits import MAX_SESSIONS_PER_CAMERA

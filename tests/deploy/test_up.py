@@ -23,9 +23,8 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 import freshfield as ff
 from freshfield.files import read_status
 from freshfield.scenario import ScenarioError, load
-from freshfield_up import child_process, commands
+from freshfield_up import child_process, commands, launcher
 from freshfield_up import healthy as health_check
-from freshfield_up import launcher as launcher
 from freshfield_up.child_process import Child
 from freshfield_up.cli import main, seconds
 from freshfield_up.commands import ProcessSet

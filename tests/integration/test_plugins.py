@@ -17,7 +17,7 @@ from camera_node.node import Node, NodeOptions
 from camera_node.settings import source_config
 from camera_node.sources.base import pixels
 from channel_emu.model.settings import channel_from_mapping
-from edge_server.experiments.virtual.simulate import main as simulate
+from edge_server.experiments.virtual.simulate_command import main as simulate
 from edge_server.export import ExportError
 from edge_server.export.run_source import open_source
 from edge_server.fields import checkpoint

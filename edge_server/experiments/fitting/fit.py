@@ -191,7 +191,7 @@ class Fit(ViewedField):
     def save(self, folder: Path | str) -> dict[str, Any]:
         """Write checkpoint, images and report to a folder, which ``load``, ``edge-server render`` and ``edge-server
         export`` open. Returns report.json. Raises OSError."""
-        from edge_server.report.run_statistics import build_report  # draws with matplotlib
+        from edge_server.report.build_report import build_report  # draws with matplotlib
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)

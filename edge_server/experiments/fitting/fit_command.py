@@ -10,7 +10,7 @@ from typing import Any
 
 from camera_node.sources.datasets.formats import FORMATS
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, parse_options
 from edge_server.experiments.fitting import ctrl_c
 from edge_server.experiments.fitting.fit import Fit, check_seconds
@@ -82,7 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.data is None:
         parser.error("name a data set: a folder, or the file that describes it")
     args.out = args.out or Path("runs") / f"fit-{data_name(args.data)}"
-    return run_command("edge-server fit", lambda: run(args), (DatasetError, OptionError), "nothing was written")
+    return exit_status("edge-server fit", lambda: run(args), (DatasetError, OptionError), "nothing was written")
 
 
 def run(request: argparse.Namespace) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import add_lpips, add_workers, at_least, parse_options
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.frontier import from_scratch, update_time
@@ -93,7 +93,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     errors = (DatasetError, EngineError, ScenarioError, ValueError)
     stopped = f"what was measured is in {args.out}: run the same command again to resume"
-    return run_command("edge-server frontier", lambda: _run(args), errors, stopped)
+    return exit_status("edge-server frontier", lambda: _run(args), errors, stopped)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -18,7 +18,7 @@ from edge_server.experiments.studies.trial import scenario_of, scene_label, scen
 from edge_server.experiments.studies.tuned_numbers import DEPTH_SCORED_FROM, DEPTH_SECONDS
 from edge_server.experiments.studies.verdicts import Claim, better
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
-from edge_server.experiments.virtual.simulate import usual_settings
+from edge_server.experiments.virtual.simulate_command import usual_settings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.scorer import SHOWN

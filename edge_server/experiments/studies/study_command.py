@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.embed import EmbeddingError
 from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, folders_of
 from edge_server.experiments.common.channels import read_channel
@@ -78,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     errors = (ScenarioError, DatasetError, StudyError, EngineError, TrainingError, ViewpointError, EmbeddingError)
     stopped = f"what is finished is in {args.out}: run the same command again to resume"
-    return run_command("edge-server study", work, errors, stopped)
+    return exit_status("edge-server study", work, errors, stopped)
 
 
 def checked(names: list[str], request: StudyRequest) -> list[str]:

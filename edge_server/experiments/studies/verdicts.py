@@ -1,9 +1,8 @@
 """Claims of studies, and the verdicts on them.
 
-Statistics that claims are made of: curves with an optimum, plateaus, trends, and differences of two policies.
+A claim is made of a statistic: whether a curve has an optimum, a plateau or a trend, or how two policies differ.
 
-Each of the functions up to ``judge`` makes a ``Statistic`` from the names of labels; differences are positive where the
-first is better.
+Functions that return a ``Statistic`` take the names of labels; differences are positive where the first is better.
 """
 
 from __future__ import annotations

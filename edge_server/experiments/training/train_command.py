@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import add_folders, add_workers, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
@@ -63,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     errors = (ScenarioError, DatasetError, EngineError, ValueError)
     stopped = f"what is finished is in {args.out}: run the same command again to resume"
-    return run_command("edge-server train-scheduler", lambda: _train(args), errors, stopped)
+    return exit_status("edge-server train-scheduler", lambda: _train(args), errors, stopped)
 
 
 def _train(args: argparse.Namespace) -> None:

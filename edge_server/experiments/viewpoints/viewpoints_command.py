@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
 from edge_server.experiments.tuned_numbers import VIEWS
 from edge_server.experiments.viewpoints.asking import ANSWERS, compare
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     errors = (ScenarioError, DatasetError, ViewpointError, OptionError, TransportError)
     stopped = f"answers are kept in {args.out / ANSWERS}" if args.ask else "nothing was written"
-    return run_command("edge-server viewpoints", lambda: _run(args), errors, stopped)
+    return exit_status("edge-server viewpoints", lambda: _run(args), errors, stopped)
 
 
 def _run(args: argparse.Namespace) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.experiments.common.folders import folders_from
-from edge_server.experiments.virtual.simulate import (
+from edge_server.experiments.virtual.simulate_command import (
     check_seconds,
     open_simulation,
     summary,

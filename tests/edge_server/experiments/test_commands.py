@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from edge_server.cli import main
-from edge_server.experiments import compare
+from edge_server.experiments import compare_command
 from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
@@ -80,7 +80,7 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
 def test_a_star_marks_what_is_decided_and_not_what_is_equal():
     gained = {"all": [0.0] * 6, "the same": [0.0] * 6, "better": [2.0, 2.1, 1.9, 2.0, 2.2, 1.8]}
     rows = [{"policy": p, "seed": k, "psnr_db": 20.0 + g} for p, of in gained.items() for k, g in enumerate(of)]
-    starred = [line for line in compare.as_text(SeedTable(rows), list(gained)).splitlines() if "*" in line]
+    starred = [line for line in compare_command.as_text(SeedTable(rows), list(gained)).splitlines() if "*" in line]
     assert len(starred) == 1 and starred[0].startswith("better") and starred[0].count("*") == 1
 
 
@@ -92,7 +92,7 @@ def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
     words = [str(scenario), "all", "freshest-k:2", "wait:60000", "--seeds", "2", "--seconds", "0.5", "--jobs", "1"]
     words += ["--json", str(out), "--results", str(tmp_path / "known.jsonl"), "--channel", "ch6-slow"]
     monkeypatch.setattr("edge_server.embed.make_embedder", lambda _: pytest.fail("no policy looks at embeddings"))
-    assert compare.main(words) == 0
+    assert compare_command.main(words) == 0
     printed = capsys.readouterr().out
     assert "freshest-k:2" in printed and "minus all" in printed and "after the lead: wait:60000\n" in printed
     found = json.loads(out.read_text())
@@ -101,4 +101,4 @@ def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
     assert everything["psnr_db"][0] > 5.0 and everything["psnr_db_over_all"] == [0.0, 0.0, 0.0]
     assert fresh["psnr_db_over_all"][0] == pytest.approx(fresh["psnr_db"][0] - everything["psnr_db"][0])
     known = (tmp_path / "known.jsonl").read_bytes()
-    assert compare.main(words) == 0 and (tmp_path / "known.jsonl").read_bytes() == known
+    assert compare_command.main(words) == 0 and (tmp_path / "known.jsonl").read_bytes() == known

@@ -10,9 +10,9 @@ import torch
 from torch.nn.functional import adaptive_avg_pool2d
 
 from edge_server.cli import main as edge_server
-from edge_server.fidelity import fetch_lpips, lpips_network
+from edge_server.fidelity import fetch_lpips_command, lpips_network
 from edge_server.fidelity.baselines import BaselineMean, baseline, mean_color_db, nearest_view, view_db
-from edge_server.fidelity.fetch_lpips import FetchError, convert
+from edge_server.fidelity.fetch_lpips_command import FetchError, convert
 from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips, weights_folder
 from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags, moving_mask
@@ -328,7 +328,7 @@ def test_the_command_says_where_it_wrote_what_it_fetched(tmp_path, monkeypatch, 
     features = {name.removeprefix("features."): array for name, array in published[0].items()}
     lins = {f"{name}.model.1.weight": array.reshape(1, -1, 1, 1) for name, array in published[1].items()}
     refused(FetchError, "cannot be used", convert, {k: v for k, v in features.items() if k != "3.bias"}, lins, tmp_path)
-    monkeypatch.setattr(fetch_lpips, "_fetch", lambda: (features, lins))
+    monkeypatch.setattr(fetch_lpips_command, "_fetch", lambda: (features, lins))
     assert edge_server(["fetch-lpips", "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in FILES]
     for name, arrays in zip(FILES, published):

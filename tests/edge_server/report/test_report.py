@@ -11,11 +11,12 @@ from edge_server.cli import main as edge_server
 from edge_server.fidelity.scorer import METRICS, SELECTED
 from edge_server.live.output.journal import Journal
 from edge_server.report import figures
+from edge_server.report.build_report import assemble, build_report
 from edge_server.report.conclusion import conclusion
 from edge_server.report.events import silences
 from edge_server.report.figures import draw_ages, draw_fidelity, draw_frontier
 from edge_server.report.run_files import continuous, read_run_files
-from edge_server.report.run_statistics import SERIES, assemble, build_report, fidelity, updates
+from edge_server.report.run_statistics import SERIES, fidelity, updates
 from edge_server.report.tuned_numbers import MOST_EVENTS
 from edge_server.run_records import AgesRow, EdgeStatus, UpdateCounts, UpdateRow
 from freshfield.scenario import NOTHING_HELD_OUT

@@ -16,7 +16,7 @@ from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines
 from edge_server.export import ExportError
 from edge_server.fidelity.images import BLACK
 from edge_server.fields import checkpoint
-from edge_server.report.run_statistics import build_report
+from edge_server.report.build_report import build_report
 from freshfield.geometry import look_at
 from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
 from tests.support import refused
@@ -81,7 +81,7 @@ def test_the_first_ctrl_c_while_it_saves_lets_it_finish(tmp_path, capsys, monkey
     write_photos(tmp_path / "set", 5)
     out, before = tmp_path / "out", signal.getsignal(signal.SIGINT)
     with monkeypatch.context() as patch:
-        patch.setattr("edge_server.report.run_statistics.build_report", pressed)
+        patch.setattr("edge_server.report.build_report.build_report", pressed)
         status = fit(tmp_path / "set", out, "--seconds", "0.5")
     said = capsys.readouterr()
     assert signal.getsignal(signal.SIGINT) is before

@@ -9,7 +9,7 @@ from msgspec import structs
 from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import from_scratch, frontier_command, update_time
 from edge_server.experiments.frontier.output import draw_frontier, draw_updates, recommendation
-from edge_server.experiments.virtual import costs
+from edge_server.experiments.virtual import costs_command
 from edge_server.live.frontier import best_point, read_frontier
 from edge_server.report.style import CYCLE
 from edge_server.run_records import FrontierPoint
@@ -38,7 +38,7 @@ def test_an_update_time_point_is_the_same_bit_for_bit_whatever_ran_before():
 @pytest.mark.parametrize(("layers", "charged"), [(True, (0.5, 20.0, 2.0)), (False, (0.5, 26.0, 0.0))])
 def test_a_cycle_is_charged_a_frame_of_each_camera_and_layers_every_frame(layers, charged, monkeypatch):
     measured = {"ms_per_step": 0.5, "ms_per_update": 20.0, "ms_per_view": 2.0}
-    monkeypatch.setattr(costs, "measure", lambda scenario, seconds: {"compute": measured})
+    monkeypatch.setattr(costs_command, "measure", lambda scenario, seconds: {"compute": measured})
     of = update_time.Charged(TINY, 1.0, update_time.Variant("splat", layers, {}))
     assert tuple(update_time.measure_compute(of).values()) == charged
 

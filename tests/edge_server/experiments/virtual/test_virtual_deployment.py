@@ -15,15 +15,15 @@ import yaml
 from channel_emu.model.link import EventKind
 from channel_emu.model.settings import channel_from_mapping
 from channel_emu.virtual.simulate import simulate
-from edge_server.experiments.virtual import costs
-from edge_server.experiments.virtual.costs import fitted
-from edge_server.experiments.virtual.costs import main as costs_main
+from edge_server.experiments.virtual import costs_command
+from edge_server.experiments.virtual.costs_command import fitted
+from edge_server.experiments.virtual.costs_command import main as costs_main
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.experiments.virtual.simulate import digest, main
+from edge_server.experiments.virtual.simulate_command import digest, main
 from edge_server.experiments.virtual.try_policy import try_policy
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
-from edge_server.report.run_statistics import build_report
+from edge_server.report.build_report import build_report
 from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
@@ -195,11 +195,11 @@ def test_what_a_learned_policy_decided_is_kept_as_of_a_live_run(tmp_path: Path):
 
 
 def test_costs_are_measured_into_the_file_that_a_scenario_names(tmp_path: Path, capsys):
-    out = tmp_path / "costs.json"
+    out = tmp_path / "costs_command.json"
     assert costs_main([str(write(tmp_path, steps=5)), "--seconds", "0.6", "--out", str(out)]) == 0
     found = json.loads(out.read_text())["compute"]
     assert sum(found.values()) > 0.0
-    assert read_config(load(write(tmp_path, compute="costs.json"))).compute == ComputeConfig(**found)
+    assert read_config(load(write(tmp_path, compute="costs_command.json"))).compute == ComputeConfig(**found)
     for wrong in ("missing.json", 3):
         refused(ScenarioError, r"edge\.compute", read_config, load(write(tmp_path, compute=wrong)))
 
@@ -217,8 +217,8 @@ def test_what_is_done_beside_an_update_live_is_not_charged(tmp_path: Path, monke
         field.fit = slow
         return deployment
 
-    monkeypatch.setattr(costs, "build_deployment", build)
-    assert costs.measure(load(write(tmp_path, steps=2)), 0.6)["median_ms"] < -90_000.0
+    monkeypatch.setattr(costs_command, "build_deployment", build)
+    assert costs_command.measure(load(write(tmp_path, steps=2)), 0.6)["median_ms"] < -90_000.0
 
 
 def test_costs_are_told_apart():

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips
 from freshfield.files import out_folder
 
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = command_parser("edge-server fetch-lpips", DESCRIPTION)
     parser.add_argument("--out", type=out_folder, required=True, metavar="DIR", help="folder to write")
     args = parser.parse_args(argv)
-    return run_command(parser.prog, lambda: print(*convert(*_fetch(), args.out), sep="\n"), FetchError)
+    return exit_status(parser.prog, lambda: print(*convert(*_fetch(), args.out), sep="\n"), FetchError)
 
 
 def _fetch() -> tuple[dict[str, Any], dict[str, Any]]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, folders_of
 from edge_server.experiments.common.channels import read_channel
@@ -60,7 +60,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     errors = (ScenarioError, DatasetError, EngineError, ValueError)
     kept = f"finished runs are in {args.results}: run the same command again to resume"
     stopped = kept if args.results else "nothing was kept: with --results FILE the same command would resume"
-    return run_command("edge-server compare", lambda: _run(args), errors, stopped)
+    return exit_status("edge-server compare", lambda: _run(args), errors, stopped)
 
 
 def _run(args: argparse.Namespace) -> None:

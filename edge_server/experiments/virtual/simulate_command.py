@@ -18,7 +18,7 @@ from msgspec.structs import asdict
 
 from camera_node.capture import build_cameras
 from camera_node.settings import source_config
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import add_folders, at_least, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
@@ -66,7 +66,7 @@ _METRICS = ("psnr_db", "psnr_moving_db", "ssim", "lpips", "aaoi_ms")
 def main(argv: Sequence[str] | None = None) -> int:
     """The command; returns its exit status."""
     args = _parser().parse_args(argv)
-    return run_command("edge-server simulate", lambda: _simulate(args), ValueError)
+    return exit_status("edge-server simulate", lambda: _simulate(args), ValueError)
 
 
 def _simulate(args: argparse.Namespace) -> None:

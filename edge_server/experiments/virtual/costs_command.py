@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.command import command_parser, run_command
+from edge_server.command import command_parser, exit_status
 from edge_server.experiments import tuned_numbers as tuned
 from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         write_json(args.out, found, indent=1)
         print(", ".join(f"{name} {ms:g}" for name, ms in found["compute"].items() if ms), f"-> {args.out}")
 
-    return run_command("edge-server costs", work, (ScenarioError, DatasetError, ValueError), "nothing was written")
+    return exit_status("edge-server costs", work, (ScenarioError, DatasetError, ValueError), "nothing was written")
 
 
 def measure(scenario: Scenario, seconds: float, data: Path | None = None) -> dict[str, Any]:
