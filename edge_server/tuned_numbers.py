@@ -1,27 +1,30 @@
-"""Numbers of the edge server whose folder has no such file of its own."""
+"""Numbers of the edge server's folders that have no such file of their own."""
 
 from __future__ import annotations
 
 from typing import Any
 
 # --- what the edge does where a scenario leaves it open (settings) ---
-# Of a field in layers that follows arrivals; of everything else.
+# When it updates, milliseconds and optimizer steps of an update: of a field in layers that follows arrivals
+# (ARRIVALS); of every other field (CYCLE); of a scan by cameras that move (CARRIED), where an update takes a third of
+# what a keyframe gets, so that a new one shows as soon as it is seeded.
 ARRIVALS: dict[str, Any] = {"updates": "arrivals", "update_ms": 20.0, "steps": 10}
 CYCLE: dict[str, Any] = {"updates": "cycle", "update_ms": 800.0, "steps": 100}
-# Of a scan by cameras that move: a third of what a keyframe gets, so that a new one shows as soon as it is seeded.
 CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 80.0, "steps": 8}
-# Cameras: photos that are dealt to twelve (``fox``) are no tracks, and read 8 dB less as a scan (19 against 27).
+# Most cameras of such a scan: photos that are dealt to twelve (``fox``) are no tracks, and read 8 dB less as a scan (19
+# against 27).
 MOST_CARRIED = 4
 
 # --- how far a command is (progress) ---
-LONG_WORK_S = 10.0  # of a stage of a command that is announced in a pipe, too: nobody wonders about less
+LONG_WORK_S = 10.0  # a stage that takes longer is announced in a pipe, too: nobody wonders about less
 REDRAWN_S = 1.0  # between two drawings of a command's progress: the seconds that it tells change no faster
 
-# --- networks in ONNX (embed) ---
+# --- networks in ONNX (embed.embedder, embed.depth_network) ---
 # Images per run if the model takes any number: larger batches exceed the caches and take longer per image.
 EMBEDDING_BATCH = 4
-DEPTH_MOST_ASPECT = 2.5  # of the depth network's input: attention's memory grows with the square of the pixels
+# Most that the depth network's input is longer than wide: attention's memory grows with the square of the pixels.
+DEPTH_MOST_ASPECT = 2.5
 
-# --- the foreground's detector (foreground) ---
-NMS_IOU = 0.6
-NMS_BOXES = 300  # that enter non-maximum suppression, by score
+# --- the foreground's detector (foreground.detector) ---
+NMS_IOU = 0.6  # non-maximum suppression: two boxes of a class with a larger intersection over union are one object
+NMS_BOXES = 300  # most boxes that enter it, those with the highest scores

@@ -4,104 +4,85 @@ from __future__ import annotations
 
 from typing import Any
 
-# What is scored in virtual time.
+# --- what is scored in virtual time (virtual.simulate_command, virtual.now_and_all, virtual.truth, rollouts.rollout) ---
+# ``simulate``: least time between two publications that are scored; what is shown is scored at a random instant in each
+# such period.
 SCORED_EVERY_MS = 250.0
-"""Publications, and what is shown at random instants, in ``simulate`` and the study of depth."""
-CYCLE_MS = 250.0
-"""Most between two decisions of ``simulate`` where updates follow a cycle."""
+CYCLE_MS = 250.0  # most between two decisions of ``simulate`` where updates follow a cycle
+# The same period of random instants in ``compare``, ``frontier`` and trainings of running deployments.
 SHOWN_EVERY_MS = 125.0
-"""Period of the random instants in ``compare``, ``frontier`` and trainings of running deployments."""
-MARKS_S = 2.0
-"""Period in which the frames of held-out cameras that move are scored anew."""
-SINCE_S = 4.0
-"""From which on their scores count: the first seconds are of a field that has seen next to nothing."""
-NOISE_FRAMES = 8
-"""Of a real camera, whose noise bounds what moves."""
+RESCORED_EVERY_S = 2.0  # between two times that the frames so far of moving held-out cameras are scored anew
+# From then on these scores count: the first seconds are of a field that has seen next to nothing.
+RESCORES_COUNT_FROM_S = 4.0
+NOISE_FRAMES = 8  # frames of a real camera from which its noise is estimated, which bounds what moves
 
-PROGRESS_EVERY_S = 1.0
-"""Of virtual time, between two lines of progress of ``simulate``."""
+# --- runs in virtual time (virtual.simulate_command, virtual.from_scenario) ---
+PROGRESS_EVERY_S = 1.0  # of virtual time, between two lines of progress of ``simulate``
+# Encoded frames kept in memory: in virtual time a minute of nineteen cameras passes in seconds.
 FRAME_CACHE_BYTES = 512 * 2**20
-"""Encoded frames kept in memory: in virtual time a minute of nineteen cameras passes in seconds."""
+
+# --- ``compare`` (compare_command) ---
+# Until what is shown counts, and for how long it does. Decisions have no effect until the layers of a field have begun.
 COMPARE_LEAD_S, COMPARE_SPAN_S = 5.0, 8.0
-"""Of ``compare``, until what is shown counts, and for how long it does. Decisions have no effect until the layers of a
-field have begun."""
 
-# ``costs``.
-COSTS_SHARES = (0.2, 0.6, 1.0)
-"""Steps of an update, as shares of the scenario's."""
-COSTS_SETTLED_SHARE, COSTS_SLOWEST_SHARE = 0.5, 0.1
-"""The first part of a run builds the field; a busy machine's slowest updates are left out."""
-COSTS_EPOCH_MS = 40.0
+# --- ``costs`` (virtual.costs_command) ---
+COSTS_SHARES = (0.2, 0.6, 1.0)  # steps of an update, as shares of the scenario's, one run each
+COSTS_SETTLED_SHARE = 0.5  # first share of a run's updates that is left out: they build the field
+COSTS_SLOWEST_SHARE = 0.1  # share of updates that is left out, the slowest: the machine was busy
+COSTS_EPOCH_MS = 40.0  # least time between two decisions
 
-# Intervals and verdicts over seeds (common.statistics).
-RESAMPLES = 2000
-FEWEST_SEEDS = 5
-"""For resampling; fewer say too little about how seeds differ."""
-FALSE_DISCOVERY_RATE = 0.05
-"""Expected share of wrong verdicts among those that are decided."""
-DRAWN_HEIGHT_PX = 220
-"""Of an image in a figure of images side by side."""
+# --- intervals and verdicts over seeds, and figures (common.statistics, common.drawn_images, studies.verdicts) ---
+RESAMPLES = 2000  # times that seeds are drawn anew for an interval
+FEWEST_SEEDS = 5  # for resampling; fewer say too little about how seeds differ
+FALSE_DISCOVERY_RATE = 0.05  # expected share of wrong verdicts among those that are decided
+DRAWN_HEIGHT_PX = 220  # of an image in a figure of images side by side
 
-# ``fit``, and what it is fitted to.
+# --- ``fit`` (fitting.fit, fitting.misfits, frontier.from_scratch) ---
+# Seconds after which to evaluate: dense while a field learns fastest, then every 30 s. The last slice is at least this
+# share of the whole: the learning rate falls within a slice, and a field needs a long one to converge.
 FIT_MARKS_S, FIT_THEN_EVERY_S, FIT_LAST_SHARE = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0), 30.0, 0.4
-"""Seconds after which to evaluate: dense while a field learns fastest, then every 30 s. The last slice is at least this
-share of the whole: the learning rate falls within a slice, and a field needs a long one to converge."""
-SHORTEST_SLICE_S = 0.05
-SCORED_OF_TRAINING = 8
-"""Number of training views that are scored if no view is held out."""
+SHORTEST_SLICE_S = 0.05  # of fitting; an evaluation that is due sooner is left out
+SCORED_OF_TRAINING = 8  # training views that are scored if no view is held out
+# A view is named that reads so many dB less than the median, and so many standard deviations of them all: some views
+# of a recording are blurred or show more detail. What reads more than LOOKS_RIGHT_DB fits, whatever the others read.
 MISFIT_DB, MISFIT_DEVIATIONS, LOOKS_RIGHT_DB = 6.0, 4.0, 30.0
-"""A view is named that reads so many dB less than the median, and so many standard deviations of them all: some views
-of a recording are blurred or show more detail. What reads more than LOOKS_RIGHT_DB fits, whatever the others read."""
-MISFITS_NAMED = 5
-"""Views; of the others their number is said."""
-STILL_SIZE_PX = 128
-"""Image width and height of a synthetic scene, before its scale."""
-NAMED_VIEWS = 6
-"""In an error."""
+MISFITS_NAMED = 5  # views that are named; of the others their number is said
+
+# --- what is fitted to (scenes.multiview_still, scenes.recorded) ---
+STILL_SIZE_PX = 128  # image width and height of a synthetic scene, before its scale
+NAMED_VIEWS = 6  # views that an error names
+# A pixel whose weight is larger is scored: undistortion and shrinking leave some that are masked in part.
 LEAST_SCORED_WEIGHT = 0.5
-"""A pixel whose weight is larger is scored: undistortion and shrinking leave some that are masked in part."""
 
-# Training of schedulers.
+# --- training of schedulers (rollouts.episode, rollouts.setting, training, studies.learning) ---
+# Instants lie on a grid that contains ``fidelity.tuned_numbers.MOVING_LAGS_MS``, so that evaluations share renderings
+# of the truth: one costs ten times a score.
 INSTANT_GRID_MS = 10
-"""Rendering a truth costs ten times a score. Instants lie on a grid that contains the lags of moving pixels (60, 120,
-200, 300 ms), so that evaluations share renderings."""
-TRUTHS_KEPT = 8192
-"""Renderings of held-out cameras kept in memory."""
-TRAINING_STEPS, SCRATCH_STEPS = 20, 50
-"""Optimizer steps of an update, and of one that starts with an empty field."""
-
+TRUTHS_KEPT = 8192  # renderings of held-out cameras kept in memory
+TRAINING_STEPS, SCRATCH_STEPS = 20, 50  # optimizer steps of an update; of one that starts with an empty field
+# Options with which ``splat`` learns the small images of a training faster than with its defaults: half of its
+# Gaussians, as many as an image of 64 x 64 has pixels.
 QUICK_SPLAT: dict[str, Any] = {"gaussians": 4096, "start": 2048}
-"""Options with which ``splat`` learns the small images of a training faster than with its defaults: half of its
-Gaussians, as many as an image of 64 x 64 has pixels."""
-
-FITS = 2
-"""Of every choice, whose mean is less noisy."""
-
+EVALUATION_FITS = 2  # fits of the field for each choice that is evaluated: their mean is less noisy than one
+# Batches averaged in a point of the drawn learning curve: single ones differ by more than training changes them.
 SMOOTHED_BATCHES = 9
-"""Batches averaged in a point of the drawn learning curve: single ones differ by more than training changes them."""
 
-# ``frontier``: virtual seconds in which costs are measured, and until what is shown counts.
-COSTS_S, LEAD_S = 1.0, 5.0
-LAYERS_S = 0.02
-"""Shortest update time of layers, as used in scenarios with layers."""
-STATIC_STEPS_PER_S = 250.0
-"""Of the static field of layers, whose steps run on another core."""
+# --- ``frontier`` (frontier.update_time, frontier.frontier_command) ---
+FRONTIER_COSTS_S = 1.0  # of virtual time, in which costs are measured
+FRONTIER_LEAD_S = 5.0  # of virtual time, until what is shown counts
+LAYERS_S = 0.02  # shortest update time of layers, as used in scenarios with layers
+STATIC_STEPS_PER_S = 250.0  # of the static field of layers, whose steps run on another core
 
-# Viewpoints.
-HELD_OUT = 20
-"""Held-out viewpoints of a synthetic scene, between the candidates in their sector."""
-VIEWS = 8
-"""Of a reconstruction that is compared with others, if the budget is only in meters."""
-STAGE_EMBEDDING_DIM = 8
-"""Numbers per image that policies over viewpoints are taught with."""
+# --- viewpoints (viewpoints.stage, viewpoints.viewpoints_command) ---
+HELD_OUT_VIEWPOINTS = 20  # of a synthetic scene, between the candidates in their sector
+PLANNED_VIEWS = 8  # of each reconstruction that is compared with others, if the budget is only in meters
+STAGE_EMBEDDING_DIM = 8  # numbers per image that policies over viewpoints are taught with
+# How near to a camera the field of a capture may have density, as a share of the cameras' distance from the target.
 NEAR_OF_RADIUS = 0.3
-"""Least distance of cameras for the field of a capture, in theirs from the target."""
-PATH_FRAMES, PATH_COLUMNS = 24, 6
-"""Number of images of a reconstruction along the path, and of columns in their common JPEG."""
-PATH_WIDEST_PX = 320
-PATH_FARTHEST_DEG = 60.0
-"""From the middle of the path."""
-PATH_JPEG_QUALITY = 92
-"""So that its artifacts do not affect the comparison."""
-PLAN_SHOWN_S = 10.0
-"""Time that the page has to fetch the plan, before the server ends."""
+
+# --- what people who are asked are shown (viewpoints.reconstructions, viewpoints.asking) ---
+PATH_FRAMES, PATH_COLUMNS = 24, 6  # images of a reconstruction along the path; columns of them in their common JPEG
+PATH_WIDEST_PX = 320  # largest width of such an image
+PATH_FARTHEST_DEG = 60.0  # most that the path turns to each side of its middle
+PATH_JPEG_QUALITY = 92  # from 0 to 100: its artifacts must not affect the comparison
+PLAN_SHOWN_S = 10.0  # time that the page has to fetch the plan, before the server ends

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# --- frames that wait in the buffer ---
+# --- frames that wait in the buffer (buffer) ---
 # Most frames of a camera that wait for a field that wants every frame: half a second at 30 a second.
 MOST_UNSELECTED = 16
 # After this many takes without a frame of a camera, its next one goes first, however old (after a blackout).
@@ -12,82 +12,87 @@ AS_YOUNG_NS = 1_000_000  # ages, measured from the youngest frame, are compared 
 # time from one frame to the next in `kitchen`, where it was chosen.
 FADES_MS = 40.0
 
-# --- taking frames in ---
+# --- taking frames in (field_updater, ingest) ---
 # Share of a budget in seconds for taking in new frames, if the field wants every frame. Where a field in layers needs
 # all of it, motion is followed from the fewest frames (``LEAST_ALIGNED``): nothing of `kitchen` was lost by that.
 INTAKE_SHARE = 0.6
 LEAST_TAKEN = 4  # fewest new frames to take in, however short the budget is
 SILENT_SESSION_NS = 3 * 10**9  # a session that has sent nothing for this long is not that of a second node
 
-# --- whether a camera moves ---
-APART_M, APART_DEG = 0.03, 5.0  # two places of a camera are at least so far apart
-MOVES = 2  # places that a camera leaves until it counts as moving
-IN_A_ROW = 2  # frames away from a place until the camera has left it
+# --- whether a camera moves (camera_motion) ---
+APART_M, APART_DEG = 0.03, 5.0  # two places of a camera are farther apart than one of these
+MOVES = 2  # a camera counts as moving once it has left so many places
+IN_A_ROW = 2  # a camera has left a place after so many successive frames away from it
 
-# --- keyframes of fields without keyframes of their own ---
+# --- keyframes of fields without keyframes of their own (keyframes) ---
 NEAR_KEYFRAME = 0.5  # a camera leaving a keyframe replaces its image only within this share of the distance to the next
-RESTARTS_BELOW = 16  # viewpoints: the field begins anew each time their number has doubled
+RESTARTS_BELOW = 16  # a field that began with fewer viewpoints begins anew once their number has doubled
 
-# --- the loop of updates ---
-LONGEST_SLEEP_S = 0.2  # before it looks at the controls again
+# --- the loop of updates (loop, server) ---
+LONGEST_SLEEP_S = 0.2  # of the loop, before it looks at the controls again
 ALL_DAMAGED_S = 0.01  # wait where every selected frame is damaged: newer ones will come
-TOO_SHORT, TOO_SHORT_OF = 10, 30  # updates without a step, of the latest, after which a warning is due
+TOO_SHORT, TOO_SHORT_OF = 10, 30  # a warning is due if so many of the latest so many updates made no step
 WARN_EVERY_S = 30.0  # between two warnings of one kind
-# For the update in progress when the server ends, without which there is no checkpoint. On a machine with five times as
-# much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher kills the server
-# after ``freshfield_up.tuned_numbers.GRACE_S``, of which the checkpoint and the last pictures need some.
+# Most that the server waits at its end for the update in progress, without which there is no checkpoint. On a machine
+# with five times as much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher
+# kills the server after ``freshfield_up.tuned_numbers.GRACE_S``, of which the checkpoint and the last pictures need
+# some.
 STOP_S = 20.0
 
-# --- scores: which held-out frame shows the instant of an update ---
-# More than the longest lag of what moves, so that the frame nearest to it is still here at low frame rates.
+# --- scores: which held-out frame shows the instant of an update (scoring.held_out) ---
+# Time for which held-out frames are kept beyond the longest lag of what moves, so that the frame nearest to it is
+# still here at low frame rates.
 HISTORY_BEYOND_LAGS_MS = 1000.0
-HISTORY_FRAMES = 128
+HISTORY_FRAMES = 128  # most held-out frames that are kept of a camera
 MOST_PENDING = 8  # publications that wait for their truth: more means that no held-out frames arrive
-GAP_PERIODS = 0.55  # the truth may be half a period from the present; the rest is jitter of a real camera's clock
+# Most frame periods between the truth and the present: half of one, the rest is jitter of a real camera's clock.
+GAP_PERIODS = 0.55
 
-# --- scores: what they may cost ---
+# --- scores: what they may cost (scoring.scoring_thread) ---
 SCORING_NICE = 5  # niceness: scoring serves observers and gives way to the field's updates
 WAITING_FRAMES = 256  # held-out frames that wait while one publication is scored; older ones are not needed
-WAITING_PUBLICATIONS = 2
-OPEN_PUBLICATIONS = 16
-BASELINE_EVERY = 5  # publications; where nothing is held out, scored ones
-MOST_SNAPSHOTS = 16  # kept for held-out frames that arrive late
-SILENT_CAMERA_NS = 2_000_000_000  # behind the others: such a camera's captures are not waited for
+WAITING_PUBLICATIONS = 2  # publications that wait while another one is scored; the oldest of more is left out
+OPEN_PUBLICATIONS = 16  # publications whose scores are being collected from all held-out cameras
+# Between two measurements of the baseline, in publications; where nothing is held out, in scored ones.
+BASELINE_EVERY = 5
+MOST_SNAPSHOTS = 16  # snapshots of the field that are kept for held-out frames that arrive late
+SILENT_CAMERA_NS = 2_000_000_000  # captures of a camera this far behind the others are not waited for
 SHOWN_EVERY_S = 0.4  # largest mean time between two scores of what a held-out camera is shown
 FULL_EVERY = 4  # one in this many scores of what is shown has all metrics, the others only PSNR
-# The thread may use a share of the cores' time, refilling an allowance of CPU seconds. What is shown may use its part
-# of that share; publications are scored only while the reserve, CPU seconds, is left for it. The first allowance is
-# small: in its first seconds the field needs the cores.
-SCORING_SHARE, SHOWN_SHARE, ALLOWANCE_S, RESERVE_S = 0.03, 0.02, 1.0, 0.1
-FIRST_ALLOWANCE_S = 0.2
+SCORING_SHARE = 0.03  # share of the cores' time that the thread may use: it refills an allowance
+SHOWN_SHARE = 0.02  # part of that share, of the cores' time too, for scores of what is shown
+ALLOWANCE_S = 1.0  # largest allowance, in CPU seconds
+FIRST_ALLOWANCE_S = 0.2  # the first one is smaller: in its first seconds the field needs the cores
+RESERVE_S = 0.1  # publications are scored only while so many CPU seconds are left for what is shown
 # Of held-out cameras that move, all frames so far are scored again and again, 30 ms each at 320 x 240, with this share
 # more. One publication, whose metrics cost some ten times that, is scored for so many of them.
 LOOK_BACK_SHARE, LOOKS_A_SCORE = 0.03, 12
 
-# --- what is written of a run ---
+# --- what is written of a run (output.journal, output.recorder) ---
 FINAL_AFTER = 32  # newer publications after which one without scores will not get any: a second of updates at arrivals
 LINE_EVERY_S = 0.08  # between two lines of publications without scores, on average: there may be fifty a second
 INTERVAL_SHARE = 0.01  # weight of the newest interval in their running mean
-# Of the recorder's queue: the disk may stall for seconds. A node's frames are some tens of kilobytes.
+# Most bytes and messages in the recorder's queue: the disk may stall for seconds. A node's frames are some tens of
+# kilobytes.
 MOST_QUEUED_BYTES, MOST_QUEUED = 64 * 2**20, 4096
-RECORD_EVERY_S, MESSAGE_BYTES = 0.05, 1024  # between two looks at an empty queue; of a message beside its payloads
+RECORD_EVERY_S = 0.05  # between two looks of the recorder at an empty queue
+MESSAGE_BYTES = 1024  # that a message in the queue counts beside its payloads
 
-# --- what is told of a run ---
-STATUS_PERIOD_S, AGES_PERIOD_S = 0.5, 0.2
-SNAPSHOT_TIMEOUT_S = 30.0
-LAST_SCORES_S = 4.0  # for what waits at the end, and for all frames of held-out cameras that move: 64 take 2 s
+# --- what is told of a run (server, state, ingest, grpc_services, frontier) ---
+STATUS_PERIOD_S, AGES_PERIOD_S = 0.5, 0.2  # between two writings of the status; of the cameras' ages
+SNAPSHOT_TIMEOUT_S = 30.0  # who asks for a snapshot waits so long for the update in progress
+MAX_SNAPSHOTS = 20  # in the folder of a run: a user who requests more is told to move some away
+LAST_SCORES_S = 4.0  # for scores that wait at the end, and for all frames of held-out cameras that move: 64 take 2 s
 UPDATE_TIMES, CHECK_TIMES = 4096, 4096  # latest times of updates, and of checks of frames, whose percentiles are told
-MOST_EVENTS = 200  # kept: each is in every edge.json
+MOST_EVENTS = 200  # latest ones that are kept: each is in every edge.json
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
-KEPT_PUBLICATIONS = 4096  # latest ones of ``EdgeState``
+KEPT_PUBLICATIONS = 4096  # latest publications that ``EdgeState`` keeps
 WATCH_S = 0.05  # between two looks of the operator service at new decisions; updates take hundreds of milliseconds
 USUAL_SPEED_M_PER_S = 1.0  # assumed of a scene whose speed is not given (``frontier``): a person walking
 
-# --- connections and keys ---
-CERTIFICATE_DAYS = 365  # of ``keys``
-WAITING_CONNECTIONS = 128  # to HTTP: with the usual five, a client waits seconds to be accepted during a flood
-HTTP_LINGER_S = 2.0  # most for which what still comes is read after an answer
-GRPC_END_S = 1.0  # for the server of gRPC, when the edge ends
-
-MAX_SNAPSHOTS = 20
-"""Number of snapshots in the folder of a run: a user who requests more is told to move some away."""
+# --- connections and keys (keys_command, output.guarded_http, server) ---
+CERTIFICATE_DAYS = 365  # for which a certificate of ``keys`` is valid
+# Connections that wait to be accepted by an HTTP server: with the usual five, a client waits seconds during a flood.
+WAITING_CONNECTIONS = 128
+HTTP_LINGER_S = 2.0  # after an answer, what still comes is read for so long at most
+GRPC_END_S = 1.0  # for the server of gRPC to end, when the edge does

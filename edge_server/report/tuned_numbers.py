@@ -2,42 +2,36 @@
 
 from __future__ import annotations
 
-FINAL_SHARE = 0.2
-"""Of a run, its last: ``final`` and ``shown`` are means over it."""
-LITTLE_DB = 3.0
-"""Above an image of one mean color: below that, a field shows a blur, whatever the age."""
+# --- what is said of a run (run_statistics, conclusion) ---
+FINAL_SHARE = 0.2  # last share of a run: ``final`` and ``shown`` are means over it
+LITTLE_DB = 3.0  # above an image of one mean color: a field that gains less shows a blur, whatever the age
+# Share of frames or updates: below that, what was lost or left out is not worth a clause of the conclusion.
 WORTH_SAYING = 0.05
-"""Share of frames or updates: below that, what was lost or left out is not worth a clause of the conclusion."""
 
-SILENT_MS = 3000.0
-"""Age from which on a camera counts as gone: longer than any frame of the shipped channels takes."""
-TOGETHER_S = 1.0
-"""Cameras that fall silent within that time are one event: a blackout, or a node that ended."""
-MOST_EVENTS = 40
-"""Events that are listed: a link that comes and goes would make the curves unreadable."""
+# --- events (events) ---
+SILENT_MS = 3000.0  # a camera counts as gone from this age on: longer than any frame of the shipped channels takes
+TOGETHER_S = 1.0  # cameras that fall silent within this time are one event: a blackout, or a node that ended
+MOST_EVENTS = 40  # that are listed: a link that comes and goes would make the curves unreadable
+NAMED_CAMERAS = 3  # most cameras that the line of an event names
 
+# --- a run's files, and whether they account for every frame (run_files, frame_accounting) ---
+# A row that counts from zero again is of a process that started again, if it is earlier by more than this. Rows of one
+# process are in order but for the scores of what was shown, which wait for their held-out cameras' frames; a process
+# takes longer than this to start.
 LATE_S = 1.0
-"""Rows of one process are written in order but for the scores of what was shown: they wait for their held-out
-cameras' frames. A process that starts again counts from zero, and takes longer than this to start."""
+# A killed process takes with it the frames that it wrote about in its last moments. The thesis's links hold a frame
+# for a second or two; a frame without a line this near to the end was cut off, any other was lost by something else.
 CUT_OFF_NS = 10 * 10**9
-"""A killed process takes with it the frames that it wrote about in its last moments. The thesis's links hold a
-frame for a second or two; a frame without a line this near to the end was lost by something else."""
-MOST_CONTRADICTIONS = 20
-"""That are listed, enough to see what went wrong; the count says how often."""
-NAMED_CAMERAS = 3
-"""In a line of an event."""
+MOST_CONTRADICTIONS = 20  # that are listed, enough to see what went wrong; the count says how often
 
 # --- figures (style, figures, explain_command) ---
-FIGURE_WIDTH_INCH, FIGURE_DPI = 8.4, 110
-FIGURE_COLORS = 64
-"""In a file: a quarter of the bytes, without a visible difference in curves."""
+FIGURE_WIDTH_INCH, FIGURE_DPI = 8.4, 110  # width and resolution of every figure
+FIGURE_COLORS = 64  # in a file with curves alone: a quarter of the bytes, without a visible difference
+# Colors in a file with pictures, and rounds of k-means that keep their rare colors: a third of the bytes.
 PICTURE_COLORS, PICTURE_MEANS = 256, 3
-"""The same of pictures, and rounds of k-means that keep their rare colors: a third."""
+# A legend of up to so many entries stands in a row above the axes; height of that row, in points.
 LEGEND_IN_A_ROW, LEGEND_ROW_PT = 4, 20.0
-"""Entries of a legend, and height of the row."""
+# Factor by which errors are brightened, also on the page: one of 10 % of the range is plain to see.
 ERROR_GAIN = 4.0
-"""Factor by which errors are brightened to be visible."""
-MOST_LABELS = 24
-"""Cameras with a label of their own."""
-MOST_BARS = 20
-"""Cameras with a bar of their own where a decision is explained."""
+MOST_LABELS = 24  # most cameras that have a label of their own
+MOST_BARS = 20  # most cameras that have a bar of their own where a decision is explained

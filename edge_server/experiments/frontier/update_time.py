@@ -22,8 +22,8 @@ from edge_server.experiments.common.tables import mean_or_none, over_seeds
 from edge_server.experiments.rollouts.episode import EpisodeFactory
 from edge_server.experiments.rollouts.rollout import named, rollout
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.tuned_numbers import COSTS_S, LEAD_S, STATIC_STEPS_PER_S
-from edge_server.experiments.virtual import costs_command
+from edge_server.experiments.tuned_numbers import FRONTIER_COSTS_S, FRONTIER_LEAD_S, STATIC_STEPS_PER_S
+from edge_server.experiments.virtual import costs
 from edge_server.fields.registry import option_help
 from edge_server.settings import LEAST_UPDATE_MS, ComputeConfig
 from freshfield.scenario import Scenario, parse
@@ -102,9 +102,8 @@ class Charged:
 
 def measure_compute(asked: Charged) -> dict[str, float]:
     """The time of updates on this machine, a ``ComputeConfig`` as a mapping (``edge-server costs``)."""
-    found: dict[str, float] = costs_command.measure(asked.moving.scenario(asked.speed, asked.variant), COSTS_S)[
-        "compute"
-    ]
+    scenario = asked.moving.scenario(asked.speed, asked.variant)
+    found: dict[str, float] = costs_command.measure(scenario, FRONTIER_COSTS_S)["compute"]
     if asked.variant.layers:
         return found
     # An update of a cycle decodes the newest frame of each camera, however many have arrived.
@@ -123,7 +122,7 @@ class MovingRun:
     update_s: float
     seconds: float
     compute: ComputeConfig
-    lead_s: float = LEAD_S
+    lead_s: float = FRONTIER_LEAD_S
 
     @property
     def steps(self) -> int:

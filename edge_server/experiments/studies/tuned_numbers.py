@@ -1,13 +1,10 @@
-"""Numbers of all studies.
-
-The sizes of a quick and a full pass stand in ``trial``, what a study of trials sweeps in its file.
-"""
+"""Numbers of all studies; the sizes of a quick and a full pass stand in ``trial``, what a study sweeps in its file."""
 
 from __future__ import annotations
 
-LEAST_DB = 0.1
-"""Smallest difference that supports a claim."""
-
+# --- claims (verdicts, waiting_curves) ---
+LEAST_DB = 0.1  # smallest difference of PSNR that supports a claim
+# A curve is on its plateau if it is this near to its best value: dB, or the metric's own unit.
 PLATEAU_NEAR = {
     "psnr_db": 0.3,
     "psnr_moving_db": 0.3,
@@ -16,28 +13,16 @@ PLATEAU_NEAR = {
     "ssim": 0.01,
     "lpips": 0.01,
 }
-"""A curve is on its plateau if it is this near to its best value."""
 
-TRIAL_FPS = 100 / 3
-"""Of synthetic scenes: the thesis's capture period of 30 ms."""
-
-TRIAL_PATIENCE = 20
-"""Times ``every_ms``, until a trial has failed."""
-
-FIRST_DECISION_MS = 900.0
-"""Least instant of a trial's first decision."""
-
-STAGGER_MS = 217.0
-"""Between the decision instants of successive seeds; not whole frames, so seeds sample all capture phases."""
-
+# --- trials (trial) ---
+TRIAL_FPS = 100 / 3  # frames a second of synthetic scenes: the thesis's capture period of 30 ms
+TRIAL_PATIENCE = 20  # a trial has failed after so many times ``every_ms``
+FIRST_DECISION_MS = 900.0  # least instant of a trial's first decision
+STAGGER_MS = 217.0  # between those of successive seeds; not whole frames, so seeds sample all capture phases
+# Random instants at which a publication of a trial is scored, one in each equal part of the time it is shown.
 SHOWN_INSTANTS = 3
-"""Random instants at which a publication of a trial is scored, one in each equal part of the time it is shown."""
 
-DEPTH_SECONDS = {True: 6.0, False: 12.0}
-"""Length of a run with depth, by whether it is a quick pass."""
-
-DEPTH_SCORED_FROM = 2.0 / 3.0
-"""Of such a run: layers have begun by then."""
-
-TRAININGS = {True: 1, False: 3}
-"""Repeated trainings, by whether it is a quick pass; their spread is part of the interval."""
+# --- passes: True is the quick one, False the full one (depth_rate, learning) ---
+DEPTH_SECONDS = {True: 6.0, False: 12.0}  # length of a run with depth
+DEPTH_SCORED_FROM = 2.0 / 3.0  # share of such a run after which it is scored: layers have begun by then
+TRAININGS = {True: 1, False: 3}  # repeated trainings; their spread is part of the interval

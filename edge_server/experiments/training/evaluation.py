@@ -17,7 +17,7 @@ from edge_server.experiments.engine import Engine
 from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.tuned_numbers import FITS
+from edge_server.experiments.tuned_numbers import EVALUATION_FITS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.rewards import Reward
 from edge_server.scheduler.learned.tuned_numbers import OMEGAS_MS
@@ -88,7 +88,7 @@ def evaluate(
         {name: c.actor for name, c in zip(names, candidates)},
         name="evaluation",
         cameras=setting.scenario.held_out,
-        repeats=FITS,
+        repeats=EVALUATION_FITS,
     )
     fits = [
         {

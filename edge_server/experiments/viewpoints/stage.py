@@ -16,7 +16,7 @@ from camera_node.synthetic.scene import Scene
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.experiments.tuned_numbers import HELD_OUT, NEAR_OF_RADIUS, STAGE_EMBEDDING_DIM
+from edge_server.experiments.tuned_numbers import HELD_OUT_VIEWPOINTS, NEAR_OF_RADIUS, STAGE_EMBEDDING_DIM
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fidelity.images import BLACK, Color, to_bytes, to_unit
 from edge_server.fidelity.scorer import Score, Scorer
@@ -107,7 +107,7 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
         target, radius_m = np.asarray(path.target_m), path.radius_m
         sector = {"azimuths_deg": path.azimuths_deg}
     candidates = replace(half_hemisphere(target, radius_m, lens, count, **sector), bounds=scene.bounds)
-    tests = half_hemisphere(target, radius_m, lens, HELD_OUT, offset=_BETWEEN, **sector)
+    tests = half_hemisphere(target, radius_m, lens, HELD_OUT_VIEWPOINTS, offset=_BETWEEN, **sector)
     if path is not None:
         candidates = candidates.within(_arm_reaches(scenario, source, candidates))
         # Viewpoints that the robot cannot reach are not scored either.

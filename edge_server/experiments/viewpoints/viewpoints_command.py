@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
-from edge_server.experiments.tuned_numbers import VIEWS
+from edge_server.experiments.tuned_numbers import PLANNED_VIEWS
 from edge_server.experiments.viewpoints.asking import ANSWERS, compare
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
@@ -68,7 +68,7 @@ def _run(args: argparse.Namespace) -> None:
     show = None
     if args.ask:
         args.out.mkdir(parents=True, exist_ok=True)
-        views = min(budget.views or VIEWS, int(stage.candidates.reachable.sum()))
+        views = min(budget.views or PLANNED_VIEWS, int(stage.candidates.reachable.sum()))
         session, show = compare(
             stage,
             args.ask,

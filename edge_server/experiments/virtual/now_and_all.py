@@ -12,7 +12,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from camera_node.capture import Camera
-from edge_server.experiments.tuned_numbers import MARKS_S, SINCE_S
+from edge_server.experiments.tuned_numbers import RESCORED_EVERY_S, RESCORES_COUNT_FROM_S
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fidelity.so_far import score_frame, so_far
@@ -36,12 +36,12 @@ class NowAndAll:
             while schedule.due_ns(tick) < 1e9 * seconds:
                 deployment.at(schedule.due_ns(tick), partial(self._take, camera, tick))
                 tick += 1
-        for number in range(1, int(seconds / MARKS_S) + 1):
-            deployment.at(round(1e9 * number * MARKS_S), partial(self._mark, number * MARKS_S))
+        for number in range(1, int(seconds / RESCORED_EVERY_S) + 1):
+            deployment.at(round(1e9 * number * RESCORED_EVERY_S), partial(self._mark, number * RESCORED_EVERY_S))
 
     def means(self) -> dict[str, float]:
-        """Means of the scores in dB and of SSIM from SINCE_S on; empty before."""
-        late = [asdict(scores) for t_s, scores in self.rows if t_s >= SINCE_S]
+        """Means of the scores in dB and of SSIM from RESCORES_COUNT_FROM_S on; empty before."""
+        late = [asdict(scores) for t_s, scores in self.rows if t_s >= RESCORES_COUNT_FROM_S]
         names = [name for name in (late[0] if late else ()) if name.endswith(("_db", "_ssim"))]
         return {name: float(np.mean([row[name] for row in late])) for name in names if late[0][name] is not None}
 

@@ -35,6 +35,7 @@ from edge_server.page.foxglove_live import tuned_numbers as tuned
 from edge_server.page.page_thread import PageThread
 from edge_server.page.rendering import browser_image
 from edge_server.page.splats.records import weights
+from edge_server.page.tuned_numbers import PICTURE_JPEG_QUALITY
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose
@@ -152,7 +153,7 @@ class FoxgloveServer(PageThread):
             if form not in _VIEWED:
                 k = frame.intrinsics
                 pixels = np.ascontiguousarray(payload.decode(data, form, k.width, k.height)[..., :3])
-                data, form = payload.encode(pixels, "jpeg", tuned.JPEG_QUALITY), "jpeg"
+                data, form = payload.encode(pixels, "jpeg", PICTURE_JPEG_QUALITY), "jpeg"
             for channel in channels:
                 stamp = self._stamp(t_ns)
                 image = self._fox.CompressedImage(timestamp=stamp, frame_id=camera, data=data, format=form)
@@ -174,7 +175,7 @@ class FoxgloveServer(PageThread):
         k = frame.intrinsics
         lens = Pinhole(k.width, k.height, k.fx, k.fy, k.cx, k.cy).scaled(min(1.0, tuned.MOST_ROWS / k.height))
         shown = field.at(now_ns).render(frame.pose.matrix(), lens)
-        data = payload.encode(browser_image(shown.color), "jpeg", tuned.JPEG_QUALITY)
+        data = payload.encode(browser_image(shown.color), "jpeg", PICTURE_JPEG_QUALITY)
         self._send_pose(RENDERED, frame.pose, now_ns)
         self._send_lens(RENDERED, lens, now_ns)
         image = self._fox.CompressedImage(timestamp=self._stamp(now_ns), frame_id=RENDERED, data=data, format="jpeg")

@@ -3,7 +3,7 @@
     state.py            the state that a decision is made from (5.17, 6.33), and its features for a network
     observation.py      observes the state of a buffer
     learner_spec.py     everything that defines a learner, as data
-    tuned_numbers.py    weights of the rewards, bounds, and numbers of learning that no specification sets
+    tuned_numbers.py    weights of the rewards, defaults of a specification, and what none sets
     networks.py         actor and value networks; one set of weights for any number of cameras
     distributions.py    log-probabilities, exact also near 0 and 1, of non-empty sets and of omegas
     ppo.py              single-step PPO (5.23, algorithm 1), contextual-bandit PPO (6.42, algorithm 2)

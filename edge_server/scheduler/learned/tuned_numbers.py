@@ -1,14 +1,15 @@
-"""Numbers of learning to schedule that no specification sets."""
+"""Numbers of learning to schedule: defaults of a specification, and what none sets."""
 
 from __future__ import annotations
 
-# --- rewards ---
+# --- rewards (rewards) ---
 # Weights of (6.37) as 6.5 prints them: PSNR per dB, SSIM, LPIPS, age per millisecond.
 W_P, W_S, W_L, W_T = -0.02, 0.2, 0.3, 0.015
-SET_P, SET_S, SET_L = 0.02, 0.5, -1.0  # of (5.19), as 5.6.2 has them: PSNR per dB, SSIM, LPIPS
+SET_P, SET_S, SET_L = 0.02, 0.5, -1.0  # weights of (5.19), as 5.6.2 has them: PSNR per dB, SSIM, LPIPS
 
-# --- actions: thresholds and waits that are chosen from where a training is told none (learner_spec) ---
-WAITS_MS = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0)
+# --- actions to choose from, unless a training is told others (experiments.training, .studies, .rollouts) ---
+WAITS_MS = (0.0, 10.0, 20.0, 30.0, 40.0, 60.0, 80.0, 120.0, 200.0, 300.0)  # how long to wait, omega of (6.34)
+# The same by the kind of action; omega of (6.39) is a threshold.
 OMEGAS_MS = {
     "threshold": (20.0, 40.0, 60.0, 80.0, 100.0, 120.0, 150.0, 200.0, 300.0, 500.0),
     "wait": WAITS_MS,
@@ -18,15 +19,19 @@ OMEGAS_MS = {
 # --- features of a state (state) ---
 # Features are clipped to this many standard deviations: what lies beyond is a broken value, not information.
 FEATURE_LIMIT = 8.0
-# A feature that hardly varied where it was standardized says nothing; scaling must not turn it into noise.
+# Least standard deviation that a feature is divided by, as a share of the largest feature, or of 1 if that is more: one
+# that hardly varied where it was standardized says nothing, and scaling must not turn it into noise.
 MIN_SPREAD = 1e-3
 
-# --- learning (learner_spec, ppo) ---
+# --- learning: defaults of a specification (learner_spec) ---
 HIDDEN = 64  # width of all layers
-LEARNING_RATE, MINIBATCH, MAX_GRADIENT = 3e-3, 64, 0.5  # of Adam's steps; bound of the gradient's norm
+LEARNING_RATE, MINIBATCH = 3e-3, 64  # of a step of Adam: its rate, and decisions that it averages over
+MAX_GRADIENT = 0.5  # bound of the gradient's norm
 CLIP = 0.2  # epsilon of (5.23): probability ratios are clipped to 1 - epsilon ... 1 + epsilon
-PASSES, TARGET_KL = 10, 0.05  # over a batch; they end early once the policy has moved by so many nats
-ENTROPY, VALUE = 0.003, 0.5  # weights of these terms of the loss
+PASSES, TARGET_KL = 10, 0.05  # passes over a batch; they end early once the policy has moved by so many nats
+ENTROPY, VALUE = 0.003, 0.5  # weights in the loss: of the policy's entropy, and of the value's error
+
+# --- learning: what no specification sets (ppo) ---
 # Advantages that differ by less than this share of the rewards' standard deviation are errors of V.
 # Normalization does not scale them up to 1.
 MIN_ADVANTAGE_STD = 0.05
@@ -34,6 +39,6 @@ MIN_ADVANTAGE_STD = 0.05
 REMEMBERED_DECISIONS = 4096
 
 # --- decisions on disk, and what explains them (decision_record, explain) ---
-KEPT_DECISIONS = 500
-KEPT_DECISIONS_BYTES = 64_000_000
-REGIONS_A_SIDE = 8  # of an image, whose shares are found by occluding them
+KEPT_DECISIONS = 500  # latest decisions of a run that stay on disk
+KEPT_DECISIONS_BYTES = 64_000_000  # most that they take together: beyond it, fewer stay
+REGIONS_A_SIDE = 8  # regions along each side of an image, whose shares in a decision are found by occluding them

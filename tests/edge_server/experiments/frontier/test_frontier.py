@@ -120,7 +120,7 @@ def test_the_command_measures_writes_and_goes_on(tmp_path, capsys, monkeypatch):
     times_s = {"planned_s": (0.2, 0.4), "update_s": (0.1, 0.4), "run_s": 0.8}
     tiny = replace(frontier_command.QUICK, speeds=(1.0,), size=32, moving=TINY, **times_s)
     monkeypatch.setattr(frontier_command, "QUICK", tiny)
-    monkeypatch.setattr("edge_server.experiments.frontier.update_time.COSTS_S", 0.3)
+    monkeypatch.setattr("edge_server.experiments.frontier.update_time.FRONTIER_COSTS_S", 0.3)
     words = ["frontier", "--quick", "--out", str(tmp_path), *SMALL_WORDS]
     assert edge_server(words) == 0
     assert capsys.readouterr().out.splitlines()[-1].startswith("for this scene: update_ms: ")
