@@ -121,9 +121,10 @@ CORNER_QUALITY = 0.01  # least quality of a corner, as a share of the best corne
 # Keyframes of `redkitchen`, .3 s apart, have a share of more than .2 in one of ten pairs once their turns are taken
 # out, in three of four as they are.
 BESIDE_PX, BESIDE_SHARE = 1.0, 0.25
-UNTURNED = 6  # pairs of keyframes by which more contradict than agree, from which on a camera's rotation is missing
+# Pairs of keyframes by which more contradict an unchanged reported rotation than agree: then poses have no rotation.
+UNTURNED = 6
 OTHER_UNIT = 2.5  # ratio of distances that is no error of single poses: feet in meters are 3.3
-UNIT_LOG = 0.45  # difference of its logarithm from that of two units, up to which it is named
+UNIT_LOG = 0.45  # difference of its logarithm from that of another unit, up to which that unit is named
 FOLLOWED = 0.1  # share of pixels by which fewer may look as expected where reported motion leads than at best
 # Longest time between two keyframes for a leap: later the camera may be anywhere, and a fit where it was tells none.
 LONGEST_LEAP_S = 1.0
@@ -137,7 +138,7 @@ PATIENCE = 10  # frames of a camera left out in a row: then the next is taken as
 MOVED_EVERY = 4  # pixels between those that are tested
 # If an earlier frame saw further by more than this share of the depth, plus these meters, nothing was there.
 MOVED_SHARE, MOVED_M = 0.1, 0.05
-MOVED_LEAST = 0.005  # share of an image that has moved: less is noise of depth
+MOVED_LEAST = 0.005  # least share of an image's pixels where that is so: less is noise of depth
 JUDGED = 24  # newest keyframes of a camera by which its poses are judged
 MOUNT_POSES = 256  # newest poses by which an error of the mount is told: takes 15 ms
 DRIFT_SHARE = 0.6  # share of the largest correction, above which poses drift
