@@ -7,12 +7,6 @@ from typing import Annotated
 from edge_server.fields.ngp.settings import NgpSettings
 from freshfield.settings import within
 
-RAW_GAIN = 4.0  # raw density per unit of the table: it must rise in tens of steps at the hash levels' rate
-RAW_START = -1.2  # raw density where the table is 0: the thin fog that the network starts with too
-CUTOFF_DEPTH = 10.0  # optical depth behind which bins are dropped
-DARK_SHARE = 0.1  # weight of a bin without light in uniform allocation; one in full light: 1 more
-WEIGHT_FLOOR = 1e-3  # in the interlevel loss's denominator, so that a weight of 0 does not divide
-
 
 class NerfactoSettings(NgpSettings, frozen=True):
     """What can be chosen about a ``NerfactoField``.

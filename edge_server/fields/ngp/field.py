@@ -12,7 +12,8 @@ import numpy as np
 
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter
 from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
-from edge_server.fields.ngp.settings import FINEST, FINEST_AT_FIRST, FIRST, NgpSettings
+from edge_server.fields.common.tuned_numbers import NGP_FINEST, NGP_FINEST_AT_FIRST, NGP_FIRST_TABLE
+from edge_server.fields.ngp.settings import NgpSettings
 
 assert SEGMENT * FEATURES == DIRTY, "scatter and adam must use the same segments"
 
@@ -31,8 +32,8 @@ class NgpField(TrainedField):
         would only learn noise. Tables near zero."""
         s, box, finest = self.settings, self.view_store.box, self.settings.finest_resolution
         if finest is None:
-            pixels = box.pixels_across if box is not None else float(FINEST_AT_FIRST)
-            finest = int(np.clip(pixels, s.base_resolution, FINEST))
+            pixels = box.pixels_across if box is not None else float(NGP_FINEST_AT_FIRST)
+            finest = int(np.clip(pixels, s.base_resolution, NGP_FINEST))
         share = np.arange(s.levels) / max(s.levels - 1, 1)
         resolution = np.round(s.base_resolution * (finest / s.base_resolution) ** share).astype(np.int32)
         most = 1 << s.log2_table
@@ -40,7 +41,7 @@ class NgpField(TrainedField):
         dense = vertices <= most
         sizes = np.where(dense, (vertices + SEGMENT - 1) // SEGMENT * SEGMENT, most)
         first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        table = rng.uniform(-FIRST, FIRST, size=(int(first[-1]), FEATURES)).astype(np.float32)
+        table = rng.uniform(-NGP_FIRST_TABLE, NGP_FIRST_TABLE, size=(int(first[-1]), FEATURES)).astype(np.float32)
         return Grid(resolution, first, dense, table)
 
     def _tiny(self) -> Any:

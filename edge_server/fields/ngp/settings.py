@@ -7,10 +7,6 @@ from typing import Annotated
 from edge_server.fields.common.settings import TrainerSettings
 from freshfield.settings import within
 
-# Cells a side of the finest level, where the settings leave it open: at most, and as long as no pixel is known.
-FINEST, FINEST_AT_FIRST = 512, 256
-FIRST = 1e-4  # bound of the tables' first values
-
 
 class NgpSettings(TrainerSettings, frozen=True):
     """What can be chosen about an ``NgpField``.

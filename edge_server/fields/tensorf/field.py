@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.trained_field import DIRTY, TrainedField
-from edge_server.fields.common.tuned_numbers import FIRST_DENSITY
+from edge_server.fields.common.tuned_numbers import FIRST_DENSITY, TENSORF_FINEST
 from edge_server.fields.tensorf.kernels.vector_matrix import CHANNELS, MODES, ROWS, Planes, scatter_planes
-from edge_server.fields.tensorf.settings import FINEST, TensorfSettings
+from edge_server.fields.tensorf.settings import TensorfSettings
 
 assert ROWS * CHANNELS == DIRTY, "scatter_planes and adam must use the same segments"
 
@@ -60,7 +60,7 @@ def size_at(settings: TensorfSettings, box: SceneBox | None, step: int) -> int:
     """Vertices a side at a step, growing geometrically."""
     first, last = settings.resolution_start, settings.resolution
     if last is None:
-        last = int(np.clip(box.pixels_across if box is not None else first, first, max(FINEST, first)))
+        last = int(np.clip(box.pixels_across if box is not None else first, first, max(TENSORF_FINEST, first)))
     done = sum(step >= at for at in settings.upsample)
     stages = max(len(settings.upsample), 1)
     return round(first * (last / first) ** (done / stages)) if settings.upsample else last

@@ -9,8 +9,6 @@ from msgspec import Meta
 from edge_server.fields.common.settings import TrainerSettings
 from freshfield.settings import about
 
-FINEST = 256  # vertices a side by default: finer planes outgrow the second-level cache
-
 
 class TensorfSettings(TrainerSettings, frozen=True):
     """What can be chosen about a ``TensorfField``.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.cameras import tuned_numbers as tuned
 from edge_server.fields.common.field_state import from_json, to_json
+from edge_server.fields.common.tuned_numbers import SAME_POSE
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
@@ -164,7 +165,7 @@ class PoseCorrections:
     def learned_pose(self, view: View) -> Array | None:
         """As ``pose``; None where nothing was learned of this view, and nothing changes."""
         known = self.known.get(view.camera)
-        if known is None or not np.allclose(known.given, view.camera_to_world, atol=tuned.SAME_POSE):
+        if known is None or not np.allclose(known.given, view.camera_to_world, atol=SAME_POSE):
             return None
         return known.pose
 
@@ -190,7 +191,7 @@ class PoseCorrections:
     def _of(self, view: View) -> PoseCorrection:
         given = np.asarray(view.camera_to_world, dtype=np.float64)
         known = self.known.get(view.camera)
-        if known is None or not np.allclose(known.given, given, atol=tuned.SAME_POSE):
+        if known is None or not np.allclose(known.given, given, atol=SAME_POSE):
             known = self.known[view.camera] = PoseCorrection(given, at_ns=view.generated_ns)
             self._sorted = {}
         return known

@@ -1,27 +1,27 @@
-"""Numbers of the corrections of cameras, each tuned once on recorded footage."""
+"""Numbers of the corrections of cameras, each tuned once on recorded footage. None is an option."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# --- poses, corrected by the pixels that a field renders (``PoseCorrections.correct``) ---
-PIXELS = 384  # that are compared
-STEP_SHARE, LONGEST = 0.8, 1.0  # of a Gauss-Newton step that is taken; its length in one parameter, pixels
+# --- poses, corrected by the pixels that a field renders: ``PoseCorrections.correct`` (pose_corrections) ---
+PIXELS = 384  # pixels that are compared
+STEP_SHARE, LONGEST = 0.8, 1.0  # share of a Gauss-Newton step that is taken; its bound in each parameter, pixels
 PRIOR = 1e-2  # squared error that a correction at its bound costs: without detail, poses stay as given
-OUTLIER = 0.15  # residual from which on a pixel counts less: something moved, or is hidden
+OUTLIER = 0.15  # residual of a color from which on a pixel counts less: something moved, or is hidden
 
-# --- poses, corrected by a gradient (``PoseCorrections.descend``) ---
+# --- poses, corrected by a gradient: ``PoseCorrections.descend`` (pose_corrections) ---
 FARTHEST = 1.0  # longest step in a parameter, pixels
-# The squared error that a step of USUAL (meters, radians) costs: what an image hardly tells apart stays as it is.
+# DAMPING is the squared error that a step of USUAL costs (three shifts in meters, three rotations in radians): what an
+# image hardly tells apart stays as it is.
 DAMPING, USUAL = 1e-3, np.array([0.03] * 3 + [0.02] * 3)
-# The share of a step that the next view in time makes too, the one after it that share of it again, and so on for REACH
-# views: errors of tracking vary slowly, and a fit of some seconds looks at each view but a few times.
+# SPREAD is the share of a step that the next view in time makes too, the one after it that share of it again, and so on
+# for REACH views: errors of tracking vary slowly, and a fit of some seconds looks at each view but a few times.
 SPREAD, REACH = 0.8, 8
-SAME_POSE = 1e-3  # of all numbers of a matrix: another pose is another place, whose correction is not known
 
-# --- what all corrections of a camera have in common ---
-PARTS = 8  # of the path, each left out in turn (jackknife)
-LEAST_POSES = 2 * PARTS
+# --- what all corrections of a camera have in common (constant_correction) ---
+PARTS = 8  # parts of the path, each left out in turn (jackknife)
+LEAST_POSES = 2 * PARTS  # fewest poses from which anything in common is told
 # Standard errors, and root mean square errors of single poses, from which on a hint is given: refined in tiny images,
 # exact poses have as much in common as they scatter by.
 SURE, STANDS_OUT = 2.0, 1.5
@@ -34,9 +34,9 @@ CANCELS_M, CANCELS = (0.3, 20.0), 0.5
 TOLD = 0.1
 COMMON_PRIOR = 0.01  # share of the largest singular value added for the camera: what is not told is left to the world
 
-# --- poses and appearances of fields that render rays ---
+# --- poses and appearances of fields that render rays (appearance, camera_refinement) ---
 START = 40  # steps before anything is corrected: first the scene must take shape
 EVERY = 2  # steps between corrections of a pose, of one camera after the other
 APPEARANCE_FIRST = 0.3  # standard deviation of first values: from 0 the network would get no gradient
-APPEARANCE_RATE, APPEARANCE_EPSILON = 2e-2, 1e-4  # of Adam
-APPEARANCE_MOST = 3.0  # bound of every number
+APPEARANCE_RATE, APPEARANCE_EPSILON = 2e-2, 1e-4  # of Adam: learning rate and epsilon
+APPEARANCE_MOST = 3.0  # bound of every number's absolute value

@@ -22,7 +22,12 @@ from edge_server.fields.common.kernels.radiance_model import implements, sample_
 from edge_server.fields.common.kernels.rays import interval, slab, unit_cube
 from edge_server.fields.common.kernels.simd import exp32, is_finite
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
-from edge_server.fields.nerfacto.settings import CUTOFF_DEPTH, DARK_SHARE, RAW_GAIN, RAW_START
+from edge_server.fields.common.tuned_numbers import (
+    NERFACTO_CUTOFF_DEPTH,
+    NERFACTO_DARK_SHARE,
+    NERFACTO_RAW_GAIN,
+    NERFACTO_RAW_START,
+)
 
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
@@ -32,7 +37,7 @@ class ProposalSampling(NamedTuple):
 
     bins: number of bins along the whole ray. samples: number of samples allocated to them.
     uniform_share: share of the samples that is allocated uniformly.
-    interlevel: weight of the proposal's loss. decay: weight of the pull of raw densities to RAW_START.
+    interlevel: weight of the proposal's loss. decay: weight of the pull of raw densities to NERFACTO_RAW_START.
     """
 
     bins: int
@@ -45,7 +50,8 @@ class ProposalSampling(NamedTuple):
 class ProposalGrid(NamedTuple):
     """A hash grid (``hash_grid.Grid``) and, in its table from row first[-1] on, the proposal.
 
-    The proposal is cells^3 float32, x fastest; raw density is RAW_GAIN times a number, plus RAW_START.
+    The proposal is cells^3 float32, x fastest; raw density is NERFACTO_RAW_GAIN times a number, plus
+    NERFACTO_RAW_START.
     """
 
     resolution: NDArray[np.int32]
@@ -95,7 +101,7 @@ def unwarp(u, knee, slope):
 
 @device_function
 def make_bins(space, encoding, bins, o, d, enter, leave, shift, first, cell, depth, edges, at):
-    """Divide a ray into bins and keep those in occupied cells, up to optical depth CUTOFF_DEPTH.
+    """Divide a ray into bins and keep those in occupied cells, up to optical depth NERFACTO_CUTOFF_DEPTH.
 
     shift: in [0, 1), moves the raster of bins. Written from ``first`` on: cell, int32 (N,), proposal cell of
     each kept bin; depth, float32 (N,), its optical depth. edges: float32 (2, bins + 1), receives start and
@@ -128,13 +134,13 @@ def make_bins(space, encoding, bins, o, d, enter, leave, shift, first, cell, dep
             count += 1
     own = depth[first : first + count]
     for k in range(count):
-        raw = np.float32(RAW_GAIN) * own[k] + np.float32(RAW_START)
+        raw = np.float32(NERFACTO_RAW_GAIN) * own[k] + np.float32(NERFACTO_RAW_START)
         sigma = exp32(min(max(raw, np.float32(RAW_LOW)), np.float32(RAW_HIGH)))
         own[k] = sigma * (finish[k] - begin[k])
     total = _F0
     for k in range(count):
         total += own[k]
-        if total > np.float32(CUTOFF_DEPTH):
+        if total > np.float32(NERFACTO_CUTOFF_DEPTH):
             return np.int64(k + 1), finite
     return count, finite
 
@@ -166,15 +172,15 @@ def allocate_samples(weight, first, count, samples, even, shift, group, share):
     total, light, lights = _F0, _F1, _F0
     for k in range(first, first + count):
         total += _dilated(weight, k, first, first + count)
-        lights += light + np.float32(DARK_SHARE)
+        lights += light + np.float32(NERFACTO_DARK_SHARE)
         light -= weight[k]
     evenly = even if total > np.float32(1e-12) else _F1
     norm = np.float32(samples) * (_F1 - evenly) / max(total, np.float32(1e-12))
-    each = np.float32(samples) * evenly / max(lights, np.float32(DARK_SHARE))
+    each = np.float32(samples) * evenly / max(lights, np.float32(NERFACTO_DARK_SHARE))
     light = _F1
     g, pending = np.int64(0), _F0
     for k in range(first, first + count):
-        earned = norm * _dilated(weight, k, first, first + count) + each * (light + np.float32(DARK_SHARE))
+        earned = norm * _dilated(weight, k, first, first + count) + each * (light + np.float32(NERFACTO_DARK_SHARE))
         light -= weight[k]
         if pending > _F0 and (earned >= _F1 or pending + earned > np.float32(1.0001)):
             g += 1

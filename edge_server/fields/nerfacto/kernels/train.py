@@ -14,8 +14,8 @@ from edge_server.fields.common.kernels.rays import origin_of
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
 from edge_server.fields.common.kernels.train import AT, CHUNK, CHUNK_RAYS, LEAVE, draw_ray
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, activate_density, samples_until_opaque
+from edge_server.fields.common.tuned_numbers import NERFACTO_RAW_GAIN, NERFACTO_RAW_START, NERFACTO_WEIGHT_FLOOR
 from edge_server.fields.nerfacto.kernels.proposal import bin_scratch, proposal_cells_of, sample_ray
-from edge_server.fields.nerfacto.settings import RAW_GAIN, RAW_START, WEIGHT_FLOOR
 
 SCATTER_TASKS = 8  # tasks of the kernel that adds up the gradient of the grid
 
@@ -100,11 +100,11 @@ def interlevel_loss(encoding, cell, depth, weight, group, first, count, w, group
     """The proposal's loss on one ray (eq. 13) and its gradient: a group of bins must not weigh less than its
     samples.
 
-    The loss is the sum over groups of max(0, W - bound)^2 / (W + WEIGHT_FLOOR). W sums the weights w of the
+    The loss is the sum over groups of max(0, W - bound)^2 / (W + NERFACTO_WEIGHT_FLOOR). W sums the weights w of the
     samples start to stop (in groups group_of), constants here; bound sums the weights of the bins.
     cell, depth, weight, group: of bins first to first + count. slope: float32 (2, bins), scratch.
     grad: float32, like depth, receives ``sampling.interlevel`` times dLoss / dcell, plus the gradient of
-    sampling.decay / 2 times the squared excess of raw densities over RAW_START: an upper bound never lowers
+    sampling.decay / 2 times the squared excess of raw densities over NERFACTO_RAW_START: an upper bound never lowers
     what is too high, and behind an opaque bin no gradient tells that the surface has moved.
     Returns the loss.
     """
@@ -118,7 +118,7 @@ def interlevel_loss(encoding, cell, depth, weight, group, first, count, w, group
     for k in range(first, first + count):
         bound[group[k]] += weight[k]
     for g in range(count):
-        lack, norm = max(inside[g] - bound[g], _F0), inside[g] + np.float32(WEIGHT_FLOOR)
+        lack, norm = max(inside[g] - bound[g], _F0), inside[g] + np.float32(NERFACTO_WEIGHT_FLOOR)
         loss += lack * lack / norm
         inside[g] = np.float32(-2.0) * sampling.interlevel * lack / norm
     total, behind = _F0, _F0
@@ -130,10 +130,10 @@ def interlevel_loss(encoding, cell, depth, weight, group, first, count, w, group
         d_depth = d_w * after - behind
         behind += own * d_w
         after += own
-        raw = np.float32(RAW_GAIN) * raw_of[cell[first + k]] + np.float32(RAW_START)
+        raw = np.float32(NERFACTO_RAW_GAIN) * raw_of[cell[first + k]] + np.float32(NERFACTO_RAW_START)
         free = raw > np.float32(RAW_LOW) and raw < np.float32(RAW_HIGH)
-        pull = sampling.decay * max(raw - np.float32(RAW_START), _F0)
-        grad[first + k] = np.float32(RAW_GAIN) * (pull + (d_depth * depth[first + k] if free else _F0))
+        pull = sampling.decay * max(raw - np.float32(NERFACTO_RAW_START), _F0)
+        grad[first + k] = np.float32(NERFACTO_RAW_GAIN) * (pull + (d_depth * depth[first + k] if free else _F0))
     return loss
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.common.tuned_numbers import SAME_POSE
 from edge_server.fields.splat.layers import tuned_numbers as tuned
 from edge_server.fields.splat.layers.bump import degrees_of, find_turn
 from edge_server.fields.splat.layers.motion import ViewRow
@@ -255,7 +256,7 @@ def bumped_by(camera: FixedCamera) -> str:
 
 
 def _same_pose(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    return bool((np.abs(a - b) <= tuned.SAME_POSE).all())
+    return bool((np.abs(a - b) <= SAME_POSE).all())
 
 
 def pixel_weights(

@@ -20,7 +20,7 @@ from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.kernels import proposal
-from edge_server.fields.nerfacto.kernels.train import WEIGHT_FLOOR, interlevel_loss, scatter_proposal
+from edge_server.fields.nerfacto.kernels.train import NERFACTO_WEIGHT_FLOOR, interlevel_loss, scatter_proposal
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.small import SMALL, TINY, score
 from tests.edge_server.fields.torch_model import encode, mlp, ray_weights, shade, to_torch
@@ -154,13 +154,15 @@ def test_bins_cover_the_ray_and_know_their_cells(contracted: bool, shift: float)
     index = np.clip((_unit(middle, contracted) * CELLS).astype(int), 0, CELLS - 1)
     expected = index[:, 0] + CELLS * (index[:, 1] + CELLS * index[:, 2])
     assert (cell == expected).mean() > 0.95  # float32 may round a middle into the neighbor
-    sigma = np.exp(np.clip(proposal.RAW_GAIN * values.astype(F)[cell] + proposal.RAW_START, RAW_LOW, RAW_HIGH))
+    sigma = np.exp(
+        np.clip(proposal.NERFACTO_RAW_GAIN * values.astype(F)[cell] + proposal.NERFACTO_RAW_START, RAW_LOW, RAW_HIGH)
+    )
     np.testing.assert_allclose(depth, sigma * (edges[1] - edges[0]), rtol=1e-5)
 
 
 def test_bins_end_where_it_is_dark_and_skip_what_is_empty() -> None:
     _, depth, _, _ = _bins_of(_space(False), _encoding(np.full(CELLS**3, 1.5)), leave=2.4)
-    assert depth.sum() > proposal.CUTOFF_DEPTH > depth[:-1].sum()
+    assert depth.sum() > proposal.NERFACTO_CUTOFF_DEPTH > depth[:-1].sum()
     occupied = np.ones((16, 16, 16), np.uint8)
     occupied[:, :, 6:10] = 0  # x in the middle
     _, _, edges, _ = _bins_of(_space(False, occupied.ravel()), _encoding(np.zeros(CELLS**3)), leave=2.4)
@@ -183,7 +185,7 @@ def test_samples_are_dealt_by_weight_and_leave_no_bin_out(seed: int) -> None:
     samples, even = 24, 0.2
     left, right = np.r_[weight[0], weight[:-1]], np.r_[weight[1:], weight[-1]]
     wide = 0.5 * (np.maximum(left, weight) + np.maximum(weight, right))
-    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + proposal.DARK_SHARE
+    light = 1.0 - np.r_[0.0, np.cumsum(weight)[:-1]] + proposal.NERFACTO_DARK_SHARE
     earned = samples * ((1 - even) * wide / wide.sum() + even * light / light.sum())
     counts = np.zeros(40)
     for shift in np.linspace(0, 1, 64, endpoint=False):
@@ -236,7 +238,7 @@ def _interlevel_case(seed: int):
     length = rng.random(count) * 0.4
     if seed % 2:
         cell[4], length[4] = 7, 1e-4
-    raw = np.clip(proposal.RAW_GAIN * values.astype(F)[cell] + proposal.RAW_START, RAW_LOW, RAW_HIGH)
+    raw = np.clip(proposal.NERFACTO_RAW_GAIN * values.astype(F)[cell] + proposal.NERFACTO_RAW_START, RAW_LOW, RAW_HIGH)
     depth = np.r_[0, 0, np.exp(raw) * length].astype(F)
     group = np.r_[9, 9, 0, 0, 1, 2, 2, 2, 3, 4, 5, 5, 6, 6].astype(np.int32)
     of = np.repeat(np.arange(7), [1, 4, 1, 3, 2, 1, 1]).astype(F)
@@ -246,14 +248,14 @@ def _interlevel_case(seed: int):
 
 def _interlevel_oracle(values: torch.Tensor, cell, length, group, of, w) -> tuple[torch.Tensor, torch.Tensor]:
     """Eq. 13 over groups of bins, in double precision; and all that the gradient is of."""
-    raw = proposal.RAW_GAIN * values[torch.as_tensor(cell, dtype=torch.long)] + proposal.RAW_START
+    raw = proposal.NERFACTO_RAW_GAIN * values[torch.as_tensor(cell, dtype=torch.long)] + proposal.NERFACTO_RAW_START
     depth = torch.as_tensor(length) * raw.clamp(RAW_LOW, RAW_HIGH).exp()
-    pull = 0.02 * (raw - proposal.RAW_START).clamp(min=0).square().sum()
+    pull = 0.02 * (raw - proposal.NERFACTO_RAW_START).clamp(min=0).square().sum()
     after = torch.exp(-depth.cumsum(0))
     weight = torch.cat([torch.ones(1, dtype=after.dtype), after[:-1]]) - after
     inside = torch.zeros(7, dtype=torch.float64).index_add(0, torch.as_tensor(of, dtype=torch.long), w)
     bound = torch.zeros(7, dtype=torch.float64).index_add(0, torch.as_tensor(group, dtype=torch.long), weight)
-    loss = ((inside - bound).clamp(min=0).square() / (inside + WEIGHT_FLOOR)).sum()
+    loss = ((inside - bound).clamp(min=0).square() / (inside + NERFACTO_WEIGHT_FLOOR)).sum()
     return loss, 1.5 * loss + pull
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.scene_box import converging_point
 from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
 from edge_server.fields.splat.layers.depth.surfaces import Surface
+from edge_server.fields.splat.layers.tuned_numbers import BRIGHT, DARK
 
 
 class Overlap(NamedTuple):
@@ -108,7 +109,7 @@ def exposures(surfaces: Sequence[Surface]) -> NDArray[np.float64]:
     rows, logs = [], []
     for pair in overlaps(surfaces):
         visible = (pair.measured <= 0) | (np.abs(pair.depth / np.maximum(pair.measured, 1e-9) - 1.0) < tuned.AGREE)
-        usable = visible & (pair.colors.min(axis=(0, 2)) > tuned.DARK) & (pair.colors.max(axis=(0, 2)) < tuned.BRIGHT)
+        usable = visible & (pair.colors.min(axis=(0, 2)) > DARK) & (pair.colors.max(axis=(0, 2)) < BRIGHT)
         if np.count_nonzero(usable) >= tuned.OVERLAP_LEAST:
             row = np.zeros(count)
             row[pair.of], row[pair.seen_by] = 1.0, -1.0
