@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-# --- what is scored in virtual time (virtual.simulate_command, virtual.now_and_all, virtual.truth, rollouts.rollout) ---
+# --- scores in virtual time (virtual.simulate_command, virtual.now_and_all, virtual.truth, rollouts.rollout) ---
 # ``simulate``: least time between two publications that are scored; what is shown is scored at a random instant in each
 # such period.
 SCORED_EVERY_MS = 250.0

@@ -11,9 +11,9 @@ from edge_server.fidelity.scorer import Score
 from edge_server.live.output.journal import Journal
 from edge_server.live.state import Publication
 from edge_server.machine import machine, versions
+from edge_server.report.build_report import assemble
 from edge_server.report.report_page import render_page
 from edge_server.report.run_files import read_run_files
-from edge_server.report.build_report import assemble
 from freshfield.files import write_json
 from freshfield.ledger import Ledger
 
