@@ -22,9 +22,10 @@ MAX_LOG_SD = 5.0
 DRAWN_FRAMES = 2000  # the picture shows at most so many frames, the first ones
 
 # --- the search for two states (fit, two_states) ---
-# Searches begin with sojourns of START_FRAMES frames; each takes START_STEPS steps on the first START_SEGMENTS segments.
+# Searches begin with sojourns of START_FRAMES frames, and take START_STEPS steps on the first START_SEGMENTS segments.
 START_FRAMES, START_STEPS, START_SEGMENTS = (5, 50, 500), 8, 80
-# They begin with means and losses of the two states that are these times those of all frames, and a loss of at most this.
+# They begin with means and losses of the two states that are START_CONTRAST times those of all frames; a loss is at
+# most START_MOST_LOSS.
 START_CONTRAST, START_MOST_LOSS = (0.6, 1.6), 0.99
 SEGMENT_FRAMES = 256  # frames of a segment, taken as independent of those of the segment before
 # Steps, the gain of log likelihood that ends them, and how far a leap may go, in steps.

@@ -16,7 +16,8 @@ DRIVE_HZ = 50.0  # joint states a second of an arm that is driven through a tour
 # CONTROL_S: the control interface has to connect within it. STOPPING_S: a stop is waited for so long.
 CONTROL_S, STOPPING_S = 8, 5.0
 STOP_RAD_S2 = 2.0  # deceleration of every stop
-ARRIVED_RAD, POLL_S = 1e-3, 0.05  # largest distance of a joint from a goal that is reached; time between two looks
+# A goal is reached when no joint is farther from it than ARRIVED_RAD. POLL_S: time between two looks at that.
+ARRIVED_RAD, POLL_S = 1e-3, 0.05
 STALLED_S, STALLED_RAD = 5.0, 1e-3  # within this time even a slow arm turns by more than its encoder noise
 MOVED_RAD = (
     0.01  # largest turn of a joint by hand that is tolerated between what was shown to the operator and the answer

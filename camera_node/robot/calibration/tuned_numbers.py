@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 # --- poses of a hand-eye calibration (hand_eye.samples, hand_eye.guided_session, hand_eye.calibrate) ---
-# Least number of poses, and enough of them: with fewer than GOOD_POSES, each method's own scatter is as large as the differences
-# between methods.
+# Least number of poses, and enough of them: with fewer than GOOD_POSES, each method's own scatter is as large as the
+# differences between methods.
 MIN_POSES, GOOD_POSES = 3, 10
-# The axis of a rotation below MIN_TURN_DEG is mostly noise. The sign of the axis is lost within the margin of half a turn.
+# The axis of a rotation below MIN_TURN_DEG is mostly noise. Its sign is lost within HALF_TURN_MARGIN_DEG of half a
+# turn.
 MIN_TURN_DEG, HALF_TURN_MARGIN_DEG = 5.0, 10.0
 # Axes within a cone of about this half angle leave the translation along them undetermined.
 MIN_SPREAD_DEG = 8.0
@@ -40,7 +41,8 @@ NOTABLE_DEG, NOTABLE_MM = 0.5, 1.0
 # sample in sixty thousand.
 OUTLIER_WEIGHT = 0.35
 WARNED_OUTLIERS = 5  # most samples that are named as outliers
-# Larger median residuals, and a camera farther away than FARTHEST_M, mean wrong input: inverted poses, millimeters, or poses of another body.
+# Larger median residuals, and a camera farther away than FARTHEST_M, mean wrong input: inverted poses, millimeters, or
+# poses of another body.
 WORST_DEG, WORST_MM, FARTHEST_M = 15.0, 100.0, 5.0
 MOST_QUATERNION_ERROR = 0.01  # tolerated difference of a given quaternion's length from 1
 
@@ -83,12 +85,14 @@ MIN_SHARED, FEW_SHARED = 2, 5
 ROBUST_PX, OUTLIER_PX = 1.0, 1.0
 # A median error beyond it: pictures of one moment are not of one instant. A usual rig has less than half a pixel.
 LARGEST_PX = 5.0
-# Levenberg-Marquardt: share of the diagonal added at first and at most, number of steps, and the relative gain that ends it.
+# Levenberg-Marquardt: share of the diagonal added at first and at most, number of steps, and the relative gain that
+# ends them.
 FIRST_DAMPING, LAST_DAMPING, MOST_STEPS, SMALLEST_GAIN = 1e-3, 1e12, 100, 1e-9
 DAMPING_FACTOR = 10  # more after a step that gained nothing, less after another
 
 # --- moments of a rig (rig.rig_inputs) ---
-# Of a video, moments so far apart; the target stands still if its corners move by less between two frames.
+# Moments of a video are MOMENT_S apart. The target stands still if its corners move by less than STILL_PX between two
+# frames.
 MOMENT_S, STILL_PX = 0.5, 0.5
 # A live moment is new where the target has moved by this share of the image's width.
 NEW_SHARE = 0.05
