@@ -8,8 +8,8 @@ STATUS_PERIOD_S = 1.0  # between two writings of the status file
 # How long a clean exit waits for the answers to frames already sent.
 LAST_ANSWERS_S, LAST_ANSWERS_POLL_S = 1.0, 0.01
 READY_POLL_S = 0.01  # between two looks at whether all senders are connected, before a recording starts
-FIRST_BACKOFF_S = 0.2  # pauses between attempts to connect: the first, and the longest
-MAX_BACKOFF_S = 1.0
+FIRST_BACKOFF_S = 0.2  # first pause between attempts to connect
+MAX_BACKOFF_S = 1.0  # the longest pause
 # How long one attempt waits for a peer that cannot be reached.
 CONNECT_S = 6.0
 # How long the first frame waits for the first clock exchange; with a peer that tells no time, only once.
@@ -19,7 +19,7 @@ OFFSET_WAIT_S, OFFSET_POLL_S = 2.0, 0.01
 ANSWER_PATIENCE, LEAST_PATIENCE_S, ANSWER_TIMEOUT_S = 8.0, 1.25, 5.0
 SLOWEST_ANSWER_DECAY = 0.95  # per answer, of the slowest recent answer's time
 
-# --- the peer's clock (clock_offset), and a device's (clocks) ---
+# --- the peer's clock and a device's (clock_offset, clocks) ---
 OFFSET_PERIOD_S = 1.0  # between two exchanges
 # The first exchanges follow each other quickly, so that early frames get a good estimate too.
 FIRST_OFFSETS, FIRST_OFFSETS_PERIOD_S = 4, 0.05
@@ -27,7 +27,7 @@ KEPT_OFFSETS = 16  # latest exchanges, of which the one with the smallest error 
 OFFSET_DRIFT_PPM = 50.0  # by which an exchange's error bound grows with its age
 ARRIVAL_WINDOW_NS = 5_000_000_000  # in which the fastest sample of a device tells the offset of its clock
 
-# --- poses from a tracker or an arm (pose) ---
+# --- poses from a tracker or an arm (pose.pairing, pose.tracker) ---
 # Samples older than the newest by more than this are dropped; so many older ones in a row replace the others: the
 # sender's clock was set back.
 KEPT_POSES_NS, RESTART_POSES = 2_000_000_000, 8

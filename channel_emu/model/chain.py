@@ -155,7 +155,8 @@ class Chain:
             if self._number - mark == tuned.CHECKED_JUMPS:
                 # The constructor's check misses this rate: e.g. fast jumps before an absorbing state.
                 if (start - mark_ns) * tuned.MAX_JUMPS_PER_MS * 10 < tuned.CHECKED_JUMPS * 10**6:
-                    raise ChainError("the chain switches more than 10000 times a ms: slow it down")
+                    most = 10 * tuned.MAX_JUMPS_PER_MS
+                    raise ChainError(f"the chain switches more than {most:.0f} times a ms: slow it down")
                 mark, mark_ns = self._number, start
             target = bisect_right(self._jumps[self._visited[-1]], self._rng.pair(self._number)[1])
             self._number += 1

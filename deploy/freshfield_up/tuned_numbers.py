@@ -1,23 +1,21 @@
-"""Times of the launcher that somebody may want to change.
+"""Numbers of the launcher; what differs from run to run is an option of the command, or a key of the scenario."""
 
-What differs from run to run is an option of the command, or a key of the scenario.
-"""
+# --- while it runs (launcher) ---
+TICK_S = 0.25  # time between two looks at the processes
+LINE_EVERY_S = 5.0  # time between two status lines for people
+SAMPLE_EVERY_S = 2.0  # time between two samples of memory and processor time of every process, in ``processes.jsonl``
 
-TICK_S = 0.25  # between looks at the processes
-LINE_EVERY_S = 5.0  # a line for people
-SAMPLE_EVERY_S = 2.0
-"""Of memory and processor time of every process, in ``processes.jsonl``."""
-
+# --- starting, answers and the report (ports, healthy, deployment, launcher) ---
 ANSWER_S, PAGE_ANSWER_S = 0.5, 1.0  # a process, and the page, answer within it once they are ready
 HEALTH_ANSWER_S = 2.0  # the same of a container that is asked whether it is healthy
 STARTED_POLL_S = 0.1  # between two looks, from a program, at whether a deployment is ready
-READY_WITHIN_S = 600.0
-"""A first start compiles the field's kernels: a minute, or more on a busy machine."""
-REPORT_WITHIN_S = 300.0
+READY_WITHIN_S = 600.0  # longest wait for a process to be ready: a first start compiles the field's kernels: a minute, or more on a busy machine
+REPORT_WITHIN_S = 300.0  # longest wait for the report at the end
 
+# --- the end of a process (launcher, child_process) ---
+# Time for a process to end after SIGTERM before it is killed: the edge server waits up to 20 s for its last update.
 GRACE_S = 30.0
-"""Time for a process to end after SIGTERM before it is killed: the edge server waits up to 20 s for its last update."""
-LAST_LINES = 12  # of the log of a process that died
+LAST_LINES = 12  # that are shown of the log of a process that died
 
-FRESH_S = 10.0
-"""Age of a node's status file up to which its container is healthy; it is written twice a second."""
+# --- health of containers (healthy) ---
+FRESH_S = 10.0  # age of a node's status file up to which its container is healthy; it is written every second

@@ -1,7 +1,4 @@
-"""The numbers of the simulated controller, which no option sets.
-
-Steps are of ``joint_motion.STEP_S``, as in the real controller.
-"""
+"""Numbers of the simulated controller that no option sets; its steps are of ``joint_motion.STEP_S``."""
 
 from __future__ import annotations
 
@@ -15,8 +12,8 @@ HISTORY_STEPS = 10_000  # of true joint angles that are kept: 20 s
 # Steps that are made up for. After a longer pause of the machine the arm continues from where it was.
 MAX_CATCH_UP_STEPS = 5_000
 
-# --- ports (server, robot.flange_camera) ---
+# --- ports (server, camera_node.robot.flange_camera) ---
 IDLE_STEPS = 4  # most steps between two looks at the clock; fewer where a client asks for states more often
 MAX_WAITING_BYTES = 1 << 20  # for a client that does not read; beyond them it loses samples
-READ_BYTES = 1 << 16  # of a program, which is not interpreted
-TRUTH_TIMEOUT_S = 1.0  # of a question for the true joint angles
+READ_BYTES = 1 << 16  # read at once of a program, which is not interpreted
+TRUTH_TIMEOUT_S = 1.0  # longest wait for the answer to a question for the true joint angles

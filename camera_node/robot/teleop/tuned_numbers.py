@@ -1,9 +1,9 @@
-"""The numbers of teleoperation that no scenario sets."""
+"""Numbers of teleoperation that no scenario sets."""
 
 from __future__ import annotations
 
 # --- styluses (stylus, one_euro_filter) ---
-STEP_M, STEP_RAD = 0.005, 0.02  # of a key
+STEP_M, STEP_RAD = 0.005, 0.02  # of one press of a key
 FARTHEST_M = 10.0  # positions of a stylus farther from its origin are invalid
 LEAST_NORM, MOST_NORM = 0.5, 2.0  # of a valid quaternion, which is then made to have length 1
 MAX_MESSAGES = 64  # of a network stylus at a tick, so that a flood does not delay the arm
@@ -22,5 +22,5 @@ STEP_FRACTIONS = (1.0, 0.5, 0.2)  # of the wanted change of speed, which are tri
 # the lowest that still follows well, because the targets are smooth already.
 LOOKAHEAD_S, SERVO_GAIN = 0.1, 300.0
 MAX_LAG_RAD = 0.35  # an arm that is farther behind its target is held by something, or has stopped
-SHOW_S = 0.5  # between two lines for the operator
+SHOW_S = 0.5  # time between two lines for the operator
 LONGEST_STOP_S = 3.0  # within the limits of ``TeleopConfig`` no stop takes longer
