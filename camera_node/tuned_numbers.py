@@ -5,14 +5,15 @@ from __future__ import annotations
 # --- frames and what became of them (capture, node, sender) ---
 SHOT_CACHE_BYTES = 64 * 2**20  # of compressed shots that repeat, of all cameras of a process
 STATUS_PERIOD_S = 1.0  # between two writings of the status file
-# How long a clean exit waits for the answers to frames already sent.
+# How long a clean exit waits for the answers to frames already sent, and the time between two looks for them.
 LAST_ANSWERS_S, LAST_ANSWERS_POLL_S = 1.0, 0.01
 READY_POLL_S = 0.01  # between two looks at whether all senders are connected, before a recording starts
 FIRST_BACKOFF_S = 0.2  # first pause between attempts to connect
 MAX_BACKOFF_S = 1.0  # the longest pause
 # How long one attempt waits for a peer that cannot be reached.
 CONNECT_S = 6.0
-# How long the first frame waits for the first clock exchange; with a peer that tells no time, only once.
+# How long the first frame waits for the first clock exchange, and the time between two looks at it; with a peer that
+# tells no time, it waits only once.
 OFFSET_WAIT_S, OFFSET_POLL_S = 2.0, 0.01
 # An answer may take ANSWER_PATIENCE times as long as the slowest recent one, at least LEAST_PATIENCE_S, and at most
 # ANSWER_TIMEOUT_S, after which a stream counts as dead.

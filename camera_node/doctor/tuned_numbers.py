@@ -15,7 +15,7 @@ COVERAGE_TICKS = (0, 7, 30)  # whose shots tell whether a camera moves that neve
 # --- a camera's depth (depth_check) ---
 DEPTH_QUANTILES = (0.05, 0.5, 0.95)  # the first and the last are said, the middle one tells whether the unit is wrong
 DEPTH_MOST_POINTS = 4000  # of a camera's that are looked for: the share that agrees is then known to a percent
-DEPTH_FEWEST_POINTS, DEPTH_FEWEST_EDGES = 100, 200  # of which anything is said
+DEPTH_FEWEST_POINTS, DEPTH_FEWEST_EDGES = 100, 200  # points, and pixels at edges, of which anything is said
 DEPTH_SAME = 0.05  # relative difference of depths of one surface: the errors of sensors and poses are 1 to 2 %
 DEPTH_AGREES = 0.75  # least share of points that agree; measured: 0.86 to 1 where depth is right
 DEPTH_OVERLAPS = 0.2  # least share, of the points in each other's image, that another unit has to make agree

@@ -9,7 +9,8 @@ SAMPLE_EVERY_S = 2.0  # time between two samples of memory and processor time of
 ANSWER_S, PAGE_ANSWER_S = 0.5, 1.0  # a process, and the page, answer within it once they are ready
 HEALTH_ANSWER_S = 2.0  # the same of a container that is asked whether it is healthy
 STARTED_POLL_S = 0.1  # between two looks, from a program, at whether a deployment is ready
-READY_WITHIN_S = 600.0  # longest wait for a process to be ready: a first start compiles the field's kernels: a minute, or more on a busy machine
+# Longest wait for a process to be ready: a first start compiles the field's kernels: a minute, or more on a busy machine.
+READY_WITHIN_S = 600.0
 REPORT_WITHIN_S = 300.0  # longest wait for the report at the end
 
 # --- the end of a process (launcher, child_process) ---
