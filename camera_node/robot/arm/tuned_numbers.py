@@ -19,8 +19,8 @@ CONTROL_S, STOPPING_S = 8, 5.0
 STOP_RAD_S2 = 2.0  # deceleration of every stop
 # A goal is reached when no joint is farther from it than ARRIVED_RAD. POLL_S: time between two looks at that.
 ARRIVED_RAD, POLL_S = 1e-3, 0.05
-# An arm stands still if no joint turns by more than STALLED_RAD for STALLED_S: within this time even a slow arm turns by more
-# than its encoder noise.
+# An arm stands still if no joint turns by more than STALLED_RAD for STALLED_S: in this time even a slow arm turns by
+# more than its encoder noise.
 STALLED_S, STALLED_RAD = 5.0, 1e-3
 # Largest turn of a joint by hand that is tolerated between what was shown to the operator and the answer.
 MOVED_RAD = 0.01
