@@ -29,14 +29,14 @@ OFFSET_DRIFT_PPM = 50.0  # by which an exchange's error bound grows with its age
 ARRIVAL_WINDOW_NS = 5_000_000_000  # in which the fastest sample of a device tells the offset of its clock
 
 # --- poses from a tracker or an arm (pose.pairing, pose.tracker) ---
-# Samples older than the newest by more than this are dropped; so many older ones in a row replace the others: the
+# Samples older than the newest by more than KEPT_POSES_NS are dropped; RESTART_POSES of them in a row replace the others: the
 # sender's clock was set back.
 KEPT_POSES_NS, RESTART_POSES = 2_000_000_000, 8
 # How often a tracker's file is looked at for lines: a quarter of the 20 ms between poses of a usual one.
 TRACKER_LOOKS_S = 0.005
 # A frame waits so long for its pose: trackers take 20 to 60 ms, and captures are 67 ms apart.
 TRACKER_LATE_S = 0.1
-# Read at once, compared again later, and longest line that is kept: one has some 100.
+# Bytes read at once, compared again later, and longest line that is kept: one has some 100.
 TRACKER_LINE_BYTES = 4096
 TRACKER_JOIN_S = 2.0  # for its thread to end
 

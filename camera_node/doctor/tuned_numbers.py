@@ -14,9 +14,8 @@ COVERAGE_TICKS = (0, 7, 30)  # ticks whose shots tell whether a camera moves tha
 
 # --- a camera's depth (depth_check) ---
 DEPTH_QUANTILES = (0.05, 0.5, 0.95)  # the first and the last are said, the middle one tells whether the unit is wrong
-DEPTH_MOST_POINTS = (
-    4000  # most points of a camera that are looked for: the share that agrees is then known to a percent
-)
+# Most points of a camera that are looked for: the share that agrees is then known to a percent.
+DEPTH_MOST_POINTS = 4000
 DEPTH_FEWEST_POINTS, DEPTH_FEWEST_EDGES = 100, 200  # points, and pixels at edges, of which anything is said
 DEPTH_SAME = 0.05  # relative difference of depths of one surface: the errors of sensors and poses are 1 to 2 %
 DEPTH_AGREES = 0.75  # least share of points that agree; measured: 0.86 to 1 where depth is right
