@@ -29,8 +29,8 @@ OFFSET_DRIFT_PPM = 50.0  # by which an exchange's error bound grows with its age
 ARRIVAL_WINDOW_NS = 5_000_000_000  # in which the fastest sample of a device tells the offset of its clock
 
 # --- poses from a tracker or an arm (pose.pairing, pose.tracker) ---
-# Samples older than the newest by more than KEPT_POSES_NS are dropped; RESTART_POSES of them in a row replace the others: the
-# sender's clock was set back.
+# Samples older than the newest by more than KEPT_POSES_NS are dropped; RESTART_POSES of them in a row replace the
+# others: the sender's clock was set back.
 KEPT_POSES_NS, RESTART_POSES = 2_000_000_000, 8
 # How often a tracker's file is looked at for lines: a quarter of the 20 ms between poses of a usual one.
 TRACKER_LOOKS_S = 0.005
