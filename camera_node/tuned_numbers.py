@@ -5,14 +5,15 @@ from __future__ import annotations
 # --- frames and what became of them (capture, node, sender) ---
 SHOT_CACHE_BYTES = 64 * 2**20  # of compressed shots that repeat, of all cameras of a process
 STATUS_PERIOD_S = 1.0  # between two writings of the status file
-# How long a clean exit waits for the answers to frames already sent.
+# How long a clean exit waits for the answers to frames already sent, and the time between two looks for them.
 LAST_ANSWERS_S, LAST_ANSWERS_POLL_S = 1.0, 0.01
 READY_POLL_S = 0.01  # between two looks at whether all senders are connected, before a recording starts
 FIRST_BACKOFF_S = 0.2  # first pause between attempts to connect
 MAX_BACKOFF_S = 1.0  # the longest pause
 # How long one attempt waits for a peer that cannot be reached.
 CONNECT_S = 6.0
-# How long the first frame waits for the first clock exchange; with a peer that tells no time, only once.
+# How long the first frame waits for the first clock exchange, and the time between two looks at it; with a peer that
+# tells no time, it waits only once.
 OFFSET_WAIT_S, OFFSET_POLL_S = 2.0, 0.01
 # An answer may take ANSWER_PATIENCE times as long as the slowest recent one, at least LEAST_PATIENCE_S, and at most
 # ANSWER_TIMEOUT_S, after which a stream counts as dead.
@@ -28,14 +29,14 @@ OFFSET_DRIFT_PPM = 50.0  # by which an exchange's error bound grows with its age
 ARRIVAL_WINDOW_NS = 5_000_000_000  # in which the fastest sample of a device tells the offset of its clock
 
 # --- poses from a tracker or an arm (pose.pairing, pose.tracker) ---
-# Samples older than the newest by more than this are dropped; so many older ones in a row replace the others: the
-# sender's clock was set back.
+# Samples older than the newest by more than KEPT_POSES_NS are dropped; RESTART_POSES of them in a row replace the
+# others: the sender's clock was set back.
 KEPT_POSES_NS, RESTART_POSES = 2_000_000_000, 8
 # How often a tracker's file is looked at for lines: a quarter of the 20 ms between poses of a usual one.
 TRACKER_LOOKS_S = 0.005
 # A frame waits so long for its pose: trackers take 20 to 60 ms, and captures are 67 ms apart.
 TRACKER_LATE_S = 0.1
-# Read at once, compared again later, and longest line that is kept: one has some 100.
+# Bytes read at once, compared again later, and longest line that is kept: one has some 100.
 TRACKER_LINE_BYTES = 4096
 TRACKER_JOIN_S = 2.0  # for its thread to end
 

@@ -10,19 +10,20 @@ JUDGED_FRAMES = 5  # least number of expected frames for judging the rate; with 
 LEAST_RATE = 0.6  # least share of the frame rate asked for
 
 # --- what fixed cameras see (coverage_check) ---
-COVERAGE_TICKS = (0, 7, 30)  # whose shots tell whether a camera moves that never repeats one
+COVERAGE_TICKS = (0, 7, 30)  # ticks whose shots tell whether a camera moves that never repeats one
 
 # --- a camera's depth (depth_check) ---
 DEPTH_QUANTILES = (0.05, 0.5, 0.95)  # the first and the last are said, the middle one tells whether the unit is wrong
-DEPTH_MOST_POINTS = 4000  # of a camera's that are looked for: the share that agrees is then known to a percent
-DEPTH_FEWEST_POINTS, DEPTH_FEWEST_EDGES = 100, 200  # of which anything is said
+# Most points of a camera that are looked for: the share that agrees is then known to a percent.
+DEPTH_MOST_POINTS = 4000
+DEPTH_FEWEST_POINTS, DEPTH_FEWEST_EDGES = 100, 200  # points, and pixels at edges, of which anything is said
 DEPTH_SAME = 0.05  # relative difference of depths of one surface: the errors of sensors and poses are 1 to 2 %
 DEPTH_AGREES = 0.75  # least share of points that agree; measured: 0.86 to 1 where depth is right
 DEPTH_OVERLAPS = 0.2  # least share, of the points in each other's image, that another unit has to make agree
 DEPTH_FACTORS = (1e-3, 1e-2, 0.1, 0.3048, 1 / 0.3048, 10.0, 100.0, 1e3)  # of mistaken units: mm, cm, dm, feet
 DEPTH_CONSTANT = 0.95  # most share of one number among those measured
 DEPTH_LEAST_MEASURED = 0.02  # least share of the pixels that have a depth
-DEPTH_JUMP = 0.1  # of inverse depth between neighbors, relative to the nearer one: an edge
+DEPTH_JUMP = 0.1  # least change of inverse depth between neighbors, relative to the nearer one: an edge
 DEPTH_BESIDE = 0.06  # distance from edges to where the image is compared with them, of its width
 # Least contrast of the image at edges of depth, over that beside them. Measured: 1.16 to 2.2 in the room, the
 # path-traced kitchen and a Kinect's recording; with another camera's depth 0.74 to 1.14, mostly below 1.05.

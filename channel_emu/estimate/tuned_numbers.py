@@ -7,7 +7,8 @@ MIN_DELAYS = 20  # least number of delays that a fit needs; for two states it ta
 MOST_OVERLAPPING = 0.02  # tolerated share of frames that seem to be offered to a busy drop-new link
 # A state with fewer frames or fewer visits counts as outliers.
 MIN_FRAMES, MIN_VISITS = 10.0, 3.0
-# Exponential gaps are within a quarter of their median with probability .17, a periodic camera's nearly always.
+# A camera is periodic if more than PERIODIC_SHARE of its gaps are within NEAR_MEDIAN of their median, relatively.
+# Exponential gaps are so with probability .17, a periodic camera's nearly always.
 NEAR_MEDIAN, PERIODIC_SHARE = 0.25, 0.5
 CONSTANT_CV = 0.01  # standard deviation over mean, up to which delays count as constant
 NO_LOSS = 1e-6  # a smaller chance of a loss is none
@@ -28,8 +29,8 @@ START_FRAMES, START_STEPS, START_SEGMENTS = (5, 50, 500), 8, 80
 # most START_MOST_LOSS.
 START_CONTRAST, START_MOST_LOSS = (0.6, 1.6), 0.99
 SEGMENT_FRAMES = 256  # frames of a segment, taken as independent of those of the segment before
-# Steps, the gain of log likelihood that ends them, and how far a leap may go, in steps.
+# Most steps, the gain of log likelihood that ends them, and how far a leap may go, in steps.
 MOST_STEPS, TOLERANCE, MAX_REACH = 100, 3e-3, 64.0
-SAMPLE_STEPS = 40  # of each bootstrap sample, which starts at the fit
-# Frames of all samples together that are computed at once: some 200 MB.
+SAMPLE_STEPS = 40  # most steps of each bootstrap sample, which starts at the fit
+# Most frames of all samples together that are computed at once: some 200 MB.
 MOST_AT_ONCE = 500_000

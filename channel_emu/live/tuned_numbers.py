@@ -4,8 +4,8 @@
 MOST_CALLS = 1000  # open at once through ``channel-emu proxy``; each takes 30 kB
 MOST_METHODS = 64  # with links of their own; all others share one
 # MOST_READY: number of messages read ahead of the one being written; then the sender waits. MOST_BEHIND: behind a
-# message that is still in the link more are read, because the link must decide about each at its arrival. Dropped ones
-# are kept without their bytes.
+# message that is still in the link, up to so many are read, because the link must decide about each at its arrival.
+# Dropped ones are kept without their bytes.
 MOST_READY, MOST_BEHIND = 64, 10_000
 
 # --- frames to the edge (camera_stream, frame_proxy) ---

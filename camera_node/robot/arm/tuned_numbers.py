@@ -4,11 +4,12 @@ from __future__ import annotations
 
 # --- joint states (joint_states, rtde_process, control) ---
 # PROBE_S: a controller answers within it. CONNECT_S: the first state comes within it. STALE_S: an older state is not
-# believed; a simulated arm hits nothing, and its machine may be busy.
+# believed. SIMULATED_STALE_S: the same of a simulated arm, which hits nothing, and whose machine may be busy.
 PROBE_S, CONNECT_S, STALE_S, SIMULATED_STALE_S = 2.0, 2.5, 0.5, 10.0
 BACKOFF_S = (0.25, 0.5, 1.0, 2.0, 5.0)  # pauses between attempts to connect: after the first failure, the second, ...
 POLL_SHARE = 0.25  # of the time between two states: how often the library is asked for a new one
-NEXT_STATE_S, NEXT_STATE_POLL_S = 0.03, 0.001  # wait for the state after a frame, which interpolation needs
+# Longest wait for the state after a frame, which interpolation needs, and time between two looks for it.
+NEXT_STATE_S, NEXT_STATE_POLL_S = 0.03, 0.001
 JOIN_S = 2.0  # for the reading thread to end
 DRIVE_HZ = 50.0  # joint states a second of an arm that is driven through a tour
 
@@ -18,10 +19,11 @@ CONTROL_S, STOPPING_S = 8, 5.0
 STOP_RAD_S2 = 2.0  # deceleration of every stop
 # A goal is reached when no joint is farther from it than ARRIVED_RAD. POLL_S: time between two looks at that.
 ARRIVED_RAD, POLL_S = 1e-3, 0.05
-STALLED_S, STALLED_RAD = 5.0, 1e-3  # within this time even a slow arm turns by more than its encoder noise
-MOVED_RAD = (
-    0.01  # largest turn of a joint by hand that is tolerated between what was shown to the operator and the answer
-)
+# An arm stands still if no joint turns by more than STALLED_RAD for STALLED_S: in this time even a slow arm turns by
+# more than its encoder noise.
+STALLED_S, STALLED_RAD = 5.0, 1e-3
+# Largest turn of a joint by hand that is tolerated between what was shown to the operator and the answer.
+MOVED_RAD = 0.01
 
 # --- tours of viewpoints (viewpoint_tour, drive_tour, kinematics) ---
 FARTHEST_RAD = 2.0  # largest turn of a joint in one move

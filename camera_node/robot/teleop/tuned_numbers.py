@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 # --- styluses (stylus, one_euro_filter) ---
-STEP_M, STEP_RAD = 0.005, 0.02  # of one press of a key
+STEP_M, STEP_RAD = 0.005, 0.02  # move and turn of one press of a key
 FARTHEST_M = 10.0  # positions of a stylus farther from its origin are invalid
-LEAST_NORM, MOST_NORM = 0.5, 2.0  # of a valid quaternion, which is then made to have length 1
-MAX_MESSAGES = 64  # of a network stylus at a tick, so that a flood does not delay the arm
+LEAST_NORM, MOST_NORM = 0.5, 2.0  # bounds of the length of a valid quaternion, which is then made to have length 1
+MAX_MESSAGES = 64  # that are read of a network stylus at a tick, so that a flood does not delay the arm
 OWNED_NS = 1_000_000_000  # silence after which another sender counts
 SPEED_HZ = 2.0  # cutoff of the filter of the speed itself
 LEAST_STEP_S, MOST_STEP_S = 1e-4, 0.5  # bounds of the time between two samples: others come from a faulty clock
