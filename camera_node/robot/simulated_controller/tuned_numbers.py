@@ -1,4 +1,7 @@
-"""Numbers of the simulated controller that no option sets; its steps are of ``joint_motion.STEP_S``."""
+"""Numbers of the simulated controller that no option sets.
+
+Its steps are of ``joint_motion.STEP_S``, as the real controller's.
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
-"""Numbers of the engine that runs a function over many inputs."""
+"""Numbers of the engine that runs a function over many inputs.
+
+None changes a result: they say how work is shared out, what is done when a part of the machinery fails, and when a
+result is known.
+"""
 
 from __future__ import annotations
-
-# None changes a result: they say how work is shared out, what is done when a part of the machinery fails, and when a
-# result is known.
 
 # --- tasks and workers (engine) ---
 BATCH = 6  # inputs of one group in a task: enough to share images, few enough that Ctrl-C loses little work

@@ -1,4 +1,7 @@
-"""Numbers of the server for Foxglove."""
+"""Numbers of the server for Foxglove.
+
+The edge renders and packs for it beside learning, so each bounds how often, or how much.
+"""
 
 from __future__ import annotations
 
