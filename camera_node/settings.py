@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
 
+from camera_node.sources.tuned_numbers import FIRST_FRAME_S
 from freshfield import plugins
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_STAMP_S
 from freshfield.payload import DEFAULT_CODEC
@@ -191,7 +192,9 @@ class LiveConfig(SourceConfig, frozen=True, kw_only=True):
     calibration: Annotated[str | None, about("JSON of intrinsics and poses by camera, as for videos")] = None
     arm: Annotated[ArmConfig | None, about("an arm that carries the cameras it lists")] = None
     trajectory: Annotated[TrajectoryConfig | None, about("poses that a tracker writes to files")] = None
-    first_frame_s: Annotated[float, within(0.1, 60, "time that a camera may take until its first frame")] = 3.0
+    first_frame_s: Annotated[float, within(0.1, 60, "time that a camera may take until its first frame")] = (
+        FIRST_FRAME_S
+    )
 
     waits: ClassVar[bool] = True
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from channel_emu import tuned_numbers as tuned
+from channel_emu.live.tuned_numbers import PIECE_BYTES, RESEND_AFTER_S
 from channel_emu.model import faults, notation
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import PRESETS
@@ -297,7 +298,8 @@ def _add_proxy(commands: Any) -> None:
     sub.add_argument(
         "--tcp",
         action="store_true",
-        help="any protocol over TCP, in pieces of 16 kB, in order: a piece that is lost is sent again after 200 ms",
+        help=f"any protocol over TCP, in pieces of {PIECE_BYTES >> 10} kB, in order: "
+        f"a piece that is lost is sent again after {1000 * RESEND_AFTER_S:g} ms",
     )
     _add_live_options(sub, "message")
     sub.add_argument("--json", action="store_true", help="print the result as one JSON object")

@@ -30,7 +30,7 @@ from freshfield.files import out_file, write_json
 from freshfield.scenario import Scenario, ScenarioError, load
 from freshfield.settings import as_mapping
 
-DESCRIPTION = """\
+DESCRIPTION = f"""\
 Compare what policies show in a scenario: every policy runs with the same seeds, each of which draws a channel,
 a motion (in a synthetic scene) and the instants at which the shown image is scored on the held-out cameras.
 Computing is charged as edge.compute says. The first policy is the one that the others are compared with.
@@ -41,7 +41,7 @@ Computing is charged as edge.compute says. The first policy is the one that the 
   edge-server compare card all mine.py:Mine --results runs.jsonl   after Ctrl-C run the same command again to resume
 
 Intervals are 95 % (Student's t, over seeds; differences paired by seed). A star marks the differences that are
-decided at a false discovery rate of 5 % over all of them (Benjamini-Hochberg).
+decided at a false discovery rate of {100 * tuned.FALSE_DISCOVERY_RATE:g} % over all of them (Benjamini-Hochberg).
 """
 # metric -> (head of its column, digits, whether it is compared)
 COLUMNS = {

@@ -15,11 +15,12 @@ from edge_server.export.tuned_numbers import POINTS
 from edge_server.progress import ProgressLine
 from edge_server.surface import SurfaceError
 from edge_server.surface.settings import MeshSettings
+from edge_server.surface.tuned_numbers import SHARPENED_PIXELS
 from freshfield.files import out_file, out_folder
 
 SAVED_STREAM = ".ffsplats"
 
-DESCRIPTION = """\
+DESCRIPTION = f"""\
 Write the results of a run or fit as files for other programs. RUN is its folder, or a checkpoint in it.
 
   edge-server export runs/demo --mesh tile.ply
@@ -37,8 +38,8 @@ Write the results of a run or fit as files for other programs. RUN is its folder
 --transforms   DIR/transforms.json, DIR/images and DIR/points.ply, for nerfstudio and others
 
 Several can be given at once. Lengths in the files are meters, and z points up (in GLB: y). A mesh is fused on
-a grid from the depth that the cameras see; what no camera saw stays open. Of more than 10 million pixels only the
-depth of those images is sharpened and used that see most together.
+a grid from the depth that the cameras see; what no camera saw stays open. Of more than
+{SHARPENED_PIXELS // 10**6} million pixels only the depth of those images is sharpened and used that see most together.
 """
 
 

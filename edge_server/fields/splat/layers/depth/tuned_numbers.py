@@ -59,7 +59,8 @@ MARGIN_DEG = 20.0  # by which plates' directions are spread wider than the camer
 # (seed 7, on which it was chosen; with seed 8 0 and .2).
 UNSEEN_WEIGHT = 0.1
 SILHOUETTE_SHARE = 64  # of the width: silhouettes count as at most so wide, and as narrow as RADIUS
-MOST_HOLES = 0.06  # share of the plates without depth, above which the weight is 0: cameras may see what is there
+# Share of the plates without depth: above it that weight is 0, as cameras may see what is there, and stereo fills.
+MOST_HOLES = 0.06
 FADE_PX = 16.0  # in an image 128 pixels wide: so far from what is seen, colors are the mean's by 1 - 1 / e
 SURE = 0.3  # agreement above which a pixel counts as seen
 
