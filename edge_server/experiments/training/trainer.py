@@ -242,7 +242,10 @@ class _Checkpoint:
             found = json.loads(path.read_text())
             if found["key"] != self.key:
                 raise ValueError("it is a training with other settings or of another kind of processor")
-            lines = (self.out / "training.jsonl").read_text().splitlines()[: int(found["batches"])]
+            batches = int(found["batches"])
+            lines = (self.out / "training.jsonl").read_text().splitlines()[:batches]
+            if len(lines) < batches:
+                raise ValueError(f"training.jsonl has {len(lines)} of {batches} batches")
             return Learner.load(self.out / str(found["weights"])), [json.loads(line) for line in lines]
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise TrainingError(f"{self.out}: cannot go on: {error}: choose another --out, or delete it") from None

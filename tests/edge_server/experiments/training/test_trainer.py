@@ -56,7 +56,7 @@ def test_a_training_with_damaged_files_is_refused_in_one_line(damage: str, tmp_p
     trained(tmp_path)
     (path,) = tmp_path.glob(damage)
     whole = path.read_bytes()
-    for rest in (None, whole[: len(whole) // 2]):
+    for rest in (None, whole[: len(whole) // 2], whole.splitlines(keepends=True)[0]):
         path.unlink() if rest is None else path.write_bytes(rest)
         refused(TrainingError, "choose another --out, or delete it", trained, tmp_path)
 
