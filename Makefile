@@ -47,7 +47,7 @@ unexport PYTHONDONTWRITEBYTECODE
 INSTALL := $(PY) -m pip --disable-pip-version-check -q install --no-compile
 WARM_UP = PYTHONPATH=proto:. $(PY) -m edge_server.fields.warm_up_command --field $(1)
 # Kernels, and the numbers that they hold as constants.
-KERNELS := $(shell find edge_server/fields -path '*/kernels/*.py' -o -name settings.py -o -name tuned_numbers.py)
+KERNELS := $(shell find edge_server/fields -path '*/kernels/*.py' -o -name settings.py -o -name "*_constants.py")
 # The line of pyproject.toml that starts with a name.
 wanted = $(shell sed -n 's/^ *"\($(1)[^"]*\)",*$$/\1/p' pyproject.toml | head -n 1)
 TORCH := $(shell sed -n 's/^\(torch==[^ ]*\).*/\1/p' deploy/locks/torch-cuda.txt)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from camera_node.capture_schedule import CaptureSchedule, RateSchedule
 from camera_node.clocks import ClockError, NodeClock
 from camera_node.settings import SourceConfig

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import grpc
 import grpc.aio
 
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from freshfield.clock import Clock
 from freshfield.v1 import clock_pb2 as pb
 from freshfield.v1 import clock_pb2_grpc as rpc

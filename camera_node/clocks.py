@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Protocol
 
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from freshfield.clock import Clock
 
 

@@ -16,7 +16,7 @@ from typing import Any
 
 import grpc.aio
 
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from camera_node.capture import Camera, prepare
 from camera_node.clock_offset import ClockSync
 from camera_node.clocks import NodeClock

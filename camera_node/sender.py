@@ -14,7 +14,7 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from camera_node.clock_offset import Offset
 from camera_node.outbox import Outbox
 from freshfield.frame import Frame, to_request

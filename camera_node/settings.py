@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
 
-from camera_node.sources.tuned_numbers import FIRST_FRAME_S
+from camera_node.sources.source_constants import FIRST_FRAME_S
 from freshfield import plugins
 from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_STAMP_S
 from freshfield.payload import DEFAULT_CODEC

@@ -13,8 +13,8 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from channel_emu import tuned_numbers as tuned
-from channel_emu.live.tuned_numbers import PIECE_BYTES, RESEND_AFTER_S
+from channel_emu import emulator_constants as tuned
+from channel_emu.live.live_emulator_constants import PIECE_BYTES, RESEND_AFTER_S
 from channel_emu.model import faults, notation
 from channel_emu.model.link import DISCIPLINES, FITTED_DISCIPLINES
 from channel_emu.model.presets import PRESETS
@@ -107,9 +107,9 @@ def _serve(
 ) -> tuple[int, Report | None]:
     """Run the proxy that ``make`` returns until SIGINT or SIGTERM. Returns the exit status, and the report if nothing
     failed."""
+    from channel_emu.live.live_emulator_constants import SWITCH_INTERVAL_S
     from channel_emu.live.priority import raise_priority, return_freed_memory
     from channel_emu.live.proxy import EmulatorFailed, ProxyOptions
-    from channel_emu.live.tuned_numbers import SWITCH_INTERVAL_S
     from channel_emu.model import trace
 
     chosen = ProxyOptions(

@@ -21,7 +21,7 @@ def channel(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
 
     Arguments as of ``channel_emu.testing.EmulatedLink``. All links are closed at the end of the test.
     """
-    from channel_emu.live.tuned_numbers import SWITCH_INTERVAL_S
+    from channel_emu.live.live_emulator_constants import SWITCH_INTERVAL_S
 
     emulated_link = importlib.import_module("channel_emu.testing").EmulatedLink  # which offers this fixture
     links: list[Any] = []

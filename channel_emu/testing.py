@@ -35,7 +35,7 @@ import threading
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-from channel_emu import tuned_numbers as tuned
+from channel_emu import emulator_constants as tuned
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.report import Report, show
 from channel_emu.model.settings import ChannelConfig, channel_from_mapping

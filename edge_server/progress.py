@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from edge_server import tuned_numbers as tuned
+from edge_server import edge_constants as tuned
 
 
 class ProgressLine:

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import msgspec
 from msgspec.structs import replace
 
-from edge_server import tuned_numbers as tuned
+from edge_server import edge_constants as tuned
 from edge_server.fields.registry import FIELD
-from edge_server.fields.splat.carried_camera.tuned_numbers import LIVE_OPTIONS
+from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.limits import LONGEST_MS
 from freshfield.scenario import Scenario

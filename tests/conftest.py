@@ -37,7 +37,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # What has the machine to itself: whole deployments, and what compares instants of the wall clock. All else computes, or
 # waits for what has seconds to come: whoever runs beside it changes nothing but how long it takes.
 _FILES = {
-    "camera_node/robot/arm": "drive_tour",
+    "camera_node/robot/arm": "drive_arm_command",
     "camera_node/robot/simulated_controller": "controller",
     "camera_node/robot/teleop": "teleop_command",
     "camera_node/sources/devices": "live",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from camera_node.doctor import tuned_numbers as tuned
+from camera_node.doctor import doctor_constants as tuned
 from camera_node.settings import LiveConfig, SourceConfig
 from camera_node.sources.base import Source
 from camera_node.sources.registry import open_sources

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.doctor import tuned_numbers as tuned
+from camera_node.doctor import doctor_constants as tuned
 from camera_node.settings import SourceConfig
 from camera_node.sources.base import pixels
 from camera_node.sources.registry import open_sources

@@ -24,7 +24,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from camera_node.doctor import tuned_numbers as tuned
+from camera_node.doctor import doctor_constants as tuned
 from camera_node.pose.providers import Closable, PoseGapError
 from camera_node.settings import (
     ArmConfig,
@@ -38,7 +38,7 @@ from camera_node.settings import (
 )
 from camera_node.sources.base import rate
 from camera_node.sources.devices.feed import Image
-from camera_node.sources.tuned_numbers import LIVE_FPS
+from camera_node.sources.source_constants import LIVE_FPS
 from freshfield import transport
 from freshfield.clock import WallClock
 from freshfield.depth import DepthImage

@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from freshfield.geometry import Array
 
 T = TypeVar("T")

@@ -14,7 +14,7 @@ import threading
 import time
 from pathlib import Path
 
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from camera_node.pose.pairing import PoseGapError, SampleBuffer
 from camera_node.pose.providers import read_sample
 from camera_node.sources.datasets.records import DatasetError

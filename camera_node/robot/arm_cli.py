@@ -22,7 +22,7 @@ def add_commands(commands: Any) -> None:
         "(moveL, forceMode, getForwardKinematics, ...), and those that a real arm refuses, stop the program "
         "with a warning.",
     )
-    simulate.set_defaults(run=partial(_run, "simulated_controller.simulate_command"))
+    simulate.set_defaults(run=partial(_run, "simulated_controller.simulate_arm_command"))
     add = simulate.add_argument
     add("scenario", nargs="?", help="scenario whose source.arm gives address, robot and calibration")
     add(
@@ -39,7 +39,7 @@ def add_commands(commands: Any) -> None:
         description="Moves the arm of a scenario along the viewpoints of its source.arm.path, there and "
         "back, until Ctrl-C. Prints the joint angles first, and asks before it moves a real arm.",
     )
-    drive.set_defaults(run=partial(_run, "arm.drive_tour"))
+    drive.set_defaults(run=partial(_run, "arm.drive_arm_command"))
     add = drive.add_argument
     add("scenario", help="a scenario whose source.arm has a path")
     add("--rounds", type=int, default=0, metavar="N", help="number of tours; 0: until Ctrl-C [%(default)s]")

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 import freshfield.geometry
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from freshfield import payload
 from freshfield.files import write_bytes
 

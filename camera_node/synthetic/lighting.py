@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.synthetic import tuned_numbers as tuned
+from camera_node.synthetic import synthetic_constants as tuned
 from camera_node.synthetic.placement import MovingBody, PlacedParts
 from camera_node.synthetic.textures import Color
 from freshfield.geometry import Array

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from camera_node.synthetic.lighting import Light, contact_shadow, shade_diffuse
 from camera_node.synthetic.placement import MovingBody, Part, PlacedParts, place_parts, place_static
 from camera_node.synthetic.shapes import nearest_hit
+from camera_node.synthetic.synthetic_constants import SHADOW_BIAS
 from camera_node.synthetic.textures import Color
-from camera_node.synthetic.tuned_numbers import SHADOW_BIAS
 from freshfield.geometry import Array, Pinhole, world_rays
 
 Image = NDArray[np.uint8]

@@ -20,7 +20,7 @@ from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from camera_node.synthetic.frame_cache import FrameCache, default_folder, renderer_version
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.render import CameraRenderer, Image
-from camera_node.synthetic.tuned_numbers import WORLD_FPS, WORLD_MAX_FRAMES
+from camera_node.synthetic.synthetic_constants import WORLD_FPS, WORLD_MAX_FRAMES
 from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pose

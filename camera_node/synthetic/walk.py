@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from camera_node.synthetic import tuned_numbers as tuned
+from camera_node.synthetic import synthetic_constants as tuned
 from camera_node.synthetic.motion import phase_of
 from camera_node.synthetic.scene import Scene
 from freshfield.geometry import Array, Pose, look_at, so3_exp

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu.estimate import tuned_numbers as tuned
+from channel_emu.estimate import estimate_constants as tuned
 from channel_emu.estimate import two_states
 from channel_emu.estimate.recording import (
     MAX_DELAY_MS,

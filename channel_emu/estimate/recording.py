@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu.estimate import tuned_numbers as tuned
+from channel_emu.estimate import estimate_constants as tuned
 from channel_emu.model import trace
 from channel_emu.model.link import EventKind
 from channel_emu.model.nanoseconds import NEVER_NS

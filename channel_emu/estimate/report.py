@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from channel_emu.estimate import tuned_numbers as tuned
+from channel_emu.estimate import estimate_constants as tuned
 from channel_emu.estimate.fit import Fit, IntervalEstimate
 from freshfield.files import write_bytes
 from freshfield.untrusted import YamlWriter

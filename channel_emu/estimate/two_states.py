@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu.estimate import tuned_numbers as tuned
+from channel_emu.estimate import estimate_constants as tuned
 
 Array = NDArray[np.float64]
 

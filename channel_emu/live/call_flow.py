@@ -9,8 +9,8 @@ from typing import Any
 
 import grpc.aio
 
+from channel_emu.live.live_emulator_constants import MOST_BEHIND, MOST_READY
 from channel_emu.live.live_link import STREAM_ENDED, Ends, LiveLink, Message
-from channel_emu.live.tuned_numbers import MOST_BEHIND, MOST_READY
 from channel_emu.model.link import EventKind
 
 Read = Callable[[], Awaitable[Any]]

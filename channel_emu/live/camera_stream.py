@@ -13,7 +13,7 @@ import grpc.aio
 import numpy as np
 from google.protobuf.message import DecodeError
 
-from channel_emu.live import tuned_numbers as tuned
+from channel_emu.live import live_emulator_constants as tuned
 from channel_emu.live.live_link import STREAM_ENDED, LiveLink, Message
 from channel_emu.model.link import EventKind
 from freshfield.clock import Clock

@@ -20,7 +20,7 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from channel_emu.live import tuned_numbers as tuned
+from channel_emu.live import live_emulator_constants as tuned
 from channel_emu.live.camera_stream import PUSH, CameraStream
 from channel_emu.live.channel_service import ChannelService
 from channel_emu.live.histogram import Histogram

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from channel_emu.live import tuned_numbers as tuned
+from channel_emu.live import live_emulator_constants as tuned
 
 _PER_DECADE = 100  # bins of 2.3 %
 _DECADES = 9  # 100 ns to 100 s

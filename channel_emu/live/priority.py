@@ -13,7 +13,7 @@ import ctypes
 import os
 import platform
 
-from channel_emu.live.tuned_numbers import RETURNED_BYTES, SLICE_NS
+from channel_emu.live.live_emulator_constants import RETURNED_BYTES, SLICE_NS
 
 _SYS_SCHED_SETATTR = {"x86_64": 314, "aarch64": 274}
 _M_MMAP_THRESHOLD = -3

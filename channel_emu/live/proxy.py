@@ -23,7 +23,7 @@ from typing import Any, ClassVar
 import grpc
 import grpc.aio
 
-from channel_emu.live import tuned_numbers as tuned
+from channel_emu.live import live_emulator_constants as tuned
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.event_queue import EventQueue
 from channel_emu.live.live_link import STREAM_ENDED, ByteBudget, DelayStats, Flips, LiveLink

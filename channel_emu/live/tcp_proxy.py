@@ -17,7 +17,7 @@ from typing import Any
 import grpc.aio
 from msgspec.structs import replace
 
-from channel_emu.live import tuned_numbers as tuned
+from channel_emu.live import live_emulator_constants as tuned
 from channel_emu.live.call_flow import CallFlow
 from channel_emu.live.live_link import Flips, LiveLink, Message
 from channel_emu.live.proxy import Proxy, ProxyOptions

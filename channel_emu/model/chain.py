@@ -12,7 +12,7 @@ from bisect import bisect_right
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu import tuned_numbers as tuned
+from channel_emu import emulator_constants as tuned
 from channel_emu.model.counter_rng import CounterRng
 from channel_emu.model.nanoseconds import NEVER_NS, saturating_add, saturating_round
 

@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from channel_emu import tuned_numbers as tuned
+from channel_emu import emulator_constants as tuned
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Transit
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.settings import ChannelConfig, channel_from_mapping

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from channel_emu import tuned_numbers as tuned
+from channel_emu import emulator_constants as tuned
 from channel_emu.model.ages import RunningAge, mean_of_known
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import MAX_SIZE_BYTES, EventKind, Link, Transit

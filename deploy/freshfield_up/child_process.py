@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from freshfield_up.tuned_numbers import GRACE_S, LAST_LINES
+from freshfield_up.launcher_constants import GRACE_S, LAST_LINES
 
 # Asks Linux to end the process when its parent is gone (prctl's PR_SET_PDEATHSIG), and becomes the command. Not between
 # fork and exec: there a process with gRPC's threads may not run Python.

@@ -16,8 +16,8 @@ import time
 from pathlib import Path
 
 from freshfield.transport import add_arguments, from_arguments
+from freshfield_up.launcher_constants import FRESH_S, HEALTH_ANSWER_S
 from freshfield_up.ports import is_serving
-from freshfield_up.tuned_numbers import FRESH_S, HEALTH_ANSWER_S
 
 
 def is_fresh(folder: Path, camera: str | None) -> bool:

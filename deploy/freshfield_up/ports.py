@@ -16,7 +16,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from freshfield.scenario import ScenarioError
 from freshfield.transport import Transport
-from freshfield_up import tuned_numbers as tuned
+from freshfield_up import launcher_constants as tuned
 
 LOOPBACK = "127.0.0.1"
 

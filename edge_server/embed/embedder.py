@@ -12,7 +12,7 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from edge_server import tuned_numbers as tuned
+from edge_server import edge_constants as tuned
 from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import OUTPUT, Backbone, parse_model
 from edge_server.embed.letterbox import GRAY, blob, checked

@@ -14,7 +14,7 @@ import numpy as np
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, folders_of
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders

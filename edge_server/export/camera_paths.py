@@ -14,7 +14,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError
-from edge_server.export.tuned_numbers import MOST_FRAMES, WIDEST_GAP_DEG
+from edge_server.export.export_constants import MOST_FRAMES, WIDEST_GAP_DEG
 from edge_server.fields import View
 from freshfield.geometry import GeometryError, Pinhole, converging_point, look_at, world_up
 from freshfield.limits import MAX_IMAGE_SIDE_PX

@@ -9,13 +9,13 @@ from pathlib import Path
 
 from edge_server.command import command_parser, exit_status
 from edge_server.export import ExportError
+from edge_server.export.export_constants import POINTS
 from edge_server.export.exporter import KINDS, Exporter, check
 from edge_server.export.run_source import open_source
-from edge_server.export.tuned_numbers import POINTS
 from edge_server.progress import ProgressLine
 from edge_server.surface import SurfaceError
 from edge_server.surface.settings import MeshSettings
-from edge_server.surface.tuned_numbers import SHARPENED_PIXELS
+from edge_server.surface.surface_constants import SHARPENED_PIXELS
 from freshfield.files import out_file, out_folder
 
 SAVED_STREAM = ".ffsplats"

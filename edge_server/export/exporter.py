@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from edge_server.export import ExportError
-from edge_server.export.tuned_numbers import PIXELS_A_POINT, POINTS
+from edge_server.export.export_constants import PIXELS_A_POINT, POINTS
 from edge_server.fields import Field, View
 from edge_server.surface.settings import MeshSettings
 from freshfield.files import write_bytes

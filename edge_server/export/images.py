@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.export import ExportError
-from edge_server.export.tuned_numbers import JPEG_QUALITY, RENDERED_FPS
+from edge_server.export.export_constants import JPEG_QUALITY, RENDERED_FPS
 from edge_server.fidelity.images import to_bytes
 from edge_server.fields import View
 

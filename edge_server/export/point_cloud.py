@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from edge_server.export.colmap import Cloud
-from edge_server.export.tuned_numbers import SAME
+from edge_server.export.export_constants import SAME
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.refine_depth import on_surface
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from edge_server.export import ExportError
+from edge_server.export.export_constants import FRAMES_PER_S, GAP_S
 from edge_server.export.splats import write_splats
-from edge_server.export.tuned_numbers import FRAMES_PER_S, GAP_S
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.page.splats.messages import MessageError, SceneBlock, StreamReader, read_saved

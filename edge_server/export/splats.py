@@ -18,7 +18,7 @@ from edge_server.export.ply import write_table
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE, Gaussians
 from edge_server.fields.splat.planar import unit_quaternions
-from edge_server.fields.splat.tuned_numbers import LOG_SCALE_HIGH, LOG_SCALE_LOW
+from edge_server.fields.splat.splat_constants import LOG_SCALE_HIGH, LOG_SCALE_LOW
 from freshfield.files import write_bytes
 
 SPZ_BITS = 12  # of a position behind the binary point, as others write it

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge_server.export import ExportError, file_names
 from edge_server.export.camera_paths import Step, lens, orbit, vertical_fov_deg
-from edge_server.export.tuned_numbers import DEFAULT_HEIGHT_PX, MOST_NAMED
+from edge_server.export.export_constants import DEFAULT_HEIGHT_PX, MOST_NAMED
 from edge_server.fields import SEPARATOR, Field, RefinesCameras, Rendering, View
 from freshfield.geometry import Pinhole
 from freshfield.limits import MAX_IMAGE_SIDE_PX

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity import tuned_numbers as tuned
+from edge_server.fidelity import fidelity_constants as tuned
 from edge_server.fidelity.images import Image, to_unit
 
 _BLOCK = 8

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fidelity.fidelity_constants import PSNR_CEILING_DB
 from edge_server.fidelity.images import same_size, to_unit
-from edge_server.fidelity.tuned_numbers import PSNR_CEILING_DB
 
 
 def psnr_of_mse(mse: float) -> float:

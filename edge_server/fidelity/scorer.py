@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fidelity import tuned_numbers as tuned
+from edge_server.fidelity import fidelity_constants as tuned
 from edge_server.fidelity.images import BLACK, Color, ImageError, to_unit
 from edge_server.fidelity.moving_pixels import moving_mask
 from edge_server.fidelity.psnr import psnr

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_server.fidelity import tuned_numbers as tuned
+from edge_server.fidelity import fidelity_constants as tuned
 from edge_server.fidelity.refined import render_refined
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Renderer, View

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server import tuned_numbers as tuned
+from edge_server import edge_constants as tuned
 from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import exported_size
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of

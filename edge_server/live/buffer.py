@@ -12,7 +12,7 @@ from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from freshfield.frame import Frame
 from freshfield.limits import MAX_CAPTURE_AHEAD_NS
 

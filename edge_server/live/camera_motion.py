@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 
 
 def pose_distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float, float]:

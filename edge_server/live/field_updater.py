@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edge_server.fields import Budget, Field, FitReport, View
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.camera_motion import CameraMotion
 from edge_server.live.state import Publication

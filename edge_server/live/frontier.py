@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.run_records import Frontier, FrontierPoint
 from edge_server.settings import EdgeConfig
 from freshfield.scenario import Scenario

@@ -9,7 +9,7 @@ import threading
 import grpc
 import grpc.aio
 
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState, Publication
 from freshfield.clock import Clock

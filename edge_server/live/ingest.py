@@ -16,7 +16,7 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.buffer import FrameBuffer
 from freshfield import limits
 from freshfield.clock import Clock

@@ -22,7 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from edge_server.fields import SEPARATOR, View
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.camera_motion import pose_distance
 from edge_server.settings import KeyframesConfig
 

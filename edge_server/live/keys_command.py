@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from edge_server.live.tuned_numbers import CERTIFICATE_DAYS
+from edge_server.live.live_constants import CERTIFICATE_DAYS
 from freshfield.files import out_folder
 from freshfield.scenario import load
 from freshfield.transport import TransportError

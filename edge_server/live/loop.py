@@ -12,7 +12,7 @@ from queue import Empty, Queue
 
 from edge_server.fields import Budget, FitReport, Snapshot, View
 from edge_server.fields.compiling import told
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.field_updater import FieldUpdater, Selection
 from edge_server.live.state import Controls, Publication
 from freshfield.clock import Clock

@@ -23,9 +23,9 @@ import msgspec
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
-from edge_server.fields.common.tuned_numbers import SERVER_NICE
+from edge_server.fields.common.field_constants import SERVER_NICE
 from edge_server.fields.registry import make_field
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.field_updater import open_updater
 from edge_server.live.frontier import open_frontier
 from edge_server.live.grpc_services import GrpcThread

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from edge_server.fidelity.scorer import SELECTED, Score
 from edge_server.fields import Snapshot
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.run_records import Frontier, SoFarScores
 from edge_server.scheduler import Policy
 from freshfield.frame import Frame

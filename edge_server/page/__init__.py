@@ -19,13 +19,13 @@ from edge_server.live.state import EdgeState
 from edge_server.page.access_guard import AccessGuard
 from edge_server.page.controls import add_view_choice, notify
 from edge_server.page.network_control import EmulatorControl
+from edge_server.page.page_constants import REFRESH_S
 from edge_server.page.page_thread import PageThread
 from edge_server.page.panel import Panel
 from edge_server.page.rendering import RenderLoop
 from edge_server.page.scene import Scene
 from edge_server.page.splats.stream import SplatStream
 from edge_server.page.timelines import History
-from edge_server.page.tuned_numbers import REFRESH_S
 from freshfield.access import HttpDoor
 from freshfield.transport import Transport
 

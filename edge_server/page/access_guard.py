@@ -30,8 +30,8 @@ from websockets.exceptions import ConnectionClosedError, InvalidMessage
 from websockets.http11 import Request, Response
 
 from edge_server.page.branding import branded
+from edge_server.page.page_constants import CLOSE_S, SAY_EVERY_S
 from edge_server.page.splats.stream import STREAM, file_response
-from edge_server.page.tuned_numbers import CLOSE_S, SAY_EVERY_S
 from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
 from freshfield.limits import (
     MAX_CLICKS_HZ,

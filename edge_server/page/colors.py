@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.page.tuned_numbers import COLOR_STEPS, FRESH_MS, STALE_MS
+from edge_server.page.page_constants import COLOR_STEPS, FRESH_MS, STALE_MS
 
 RGB = tuple[int, int, int]
 

@@ -18,8 +18,8 @@ import viser
 from edge_server.live.state import EdgeState
 from edge_server.page.display_modes import ERROR, HINT, PICTURE, TRUTH, VIEWS
 from edge_server.page.markup import frontier, html
+from edge_server.page.page_constants import NOTICE_S, SNAPSHOT_NOTICE_S
 from edge_server.page.rendering import RenderLoop
-from edge_server.page.tuned_numbers import NOTICE_S, SNAPSHOT_NOTICE_S
 from edge_server.scheduler import make_policy, policy_help, short_name
 
 log = logging.getLogger(__name__)

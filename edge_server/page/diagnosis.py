@@ -8,7 +8,7 @@ import numpy as np
 
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView, Publication
-from edge_server.page.tuned_numbers import FLAT_MARGIN_DB, FLAT_SCORES, REFUSED_SHARE, STALE_MS
+from edge_server.page.page_constants import FLAT_MARGIN_DB, FLAT_SCORES, REFUSED_SHARE, STALE_MS
 
 
 def poor_picture(flat_db: float | None, publications: Sequence[Publication], cameras: Sequence[CameraView]) -> str:

@@ -14,7 +14,7 @@ from markupsafe import Markup
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, RGB, age_color, css, scale_color
-from edge_server.page.tuned_numbers import FRESH_MS, NAMED_CAMERAS, STALE_MS
+from edge_server.page.page_constants import FRESH_MS, NAMED_CAMERAS, STALE_MS
 from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
 

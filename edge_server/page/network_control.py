@@ -15,7 +15,7 @@ from typing import Any
 import grpc
 import viser
 
-from edge_server.page import tuned_numbers as tuned
+from edge_server.page import page_constants as tuned
 from edge_server.page.controls import notify
 from edge_server.page.markup import html
 from freshfield.transport import Transport, peer_text

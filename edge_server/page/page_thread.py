@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 
-from edge_server.page import tuned_numbers as tuned
+from edge_server.page import page_constants as tuned
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ import viser
 
 from edge_server.live.state import CameraView, Comparison, EdgeState, Publication
 from edge_server.page import display_modes, markup
-from edge_server.page import tuned_numbers as tuned
+from edge_server.page import page_constants as tuned
 from edge_server.page.controls import ControlPanel
 from edge_server.page.diagnosis import poor_picture
 from edge_server.page.markup import html

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Rendering, Snapshot
 from edge_server.live.state import Comparison, EdgeState
 from edge_server.page import display_modes
-from edge_server.page import tuned_numbers as tuned
+from edge_server.page import page_constants as tuned
 from edge_server.page.page_thread import PageThread
 from edge_server.page.viewpoint import row_band, visitor_camera
 from freshfield.geometry import Pinhole

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import RefinesCameras, View
 from edge_server.live.state import CameraView, EdgeState
-from edge_server.page import tuned_numbers as tuned
+from edge_server.page import page_constants as tuned
 from edge_server.page.colors import HELD_OUT, RGB, age_color
 from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint, initial_viewpoint
 from freshfield import payload

@@ -14,7 +14,7 @@ from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
 from edge_server.page.markup import chart_caption
-from edge_server.page.tuned_numbers import CHART_HEIGHT_PX, CHART_LINE_PX, CHART_POINTS, CHART_SAMPLES, WINDOW_S
+from edge_server.page.page_constants import CHART_HEIGHT_PX, CHART_LINE_PX, CHART_POINTS, CHART_SAMPLES, WINDOW_S
 
 STATE_WORDS = {"low": "good", "high": "bad"}
 """The thesis's names of a network's states, low and high traffic, for people."""

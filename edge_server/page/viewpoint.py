@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_server.page import tuned_numbers as tuned
+from edge_server.page import page_constants as tuned
 from freshfield.geometry import Pinhole, converging_point, quaternion_to_matrix, world_up
 
 Array = NDArray[np.float64]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edge_server.fidelity.scorer import SELECTED
-from edge_server.report.tuned_numbers import LITTLE_DB, WORTH_SAYING
+from edge_server.report.report_constants import LITTLE_DB, WORTH_SAYING
 from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = Mapping[str, Any]

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from itertools import groupby
 from typing import Any
 
+from edge_server.report.report_constants import MOST_EVENTS, NAMED_CAMERAS, SILENT_MS, TOGETHER_S
 from edge_server.report.run_files import RunFiles
-from edge_server.report.tuned_numbers import MOST_EVENTS, NAMED_CAMERAS, SILENT_MS, TOGETHER_S
 from edge_server.run_records import AgesRow, ChannelChange, Event
 
 

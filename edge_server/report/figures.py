@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from edge_server.fidelity.scorer import SELECTED, fidelity_title
-from edge_server.report import tuned_numbers as tuned
+from edge_server.report import report_constants as tuned
 from edge_server.report.run_files import RunFiles
 from edge_server.report.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, label_lines
 

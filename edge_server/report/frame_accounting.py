@@ -40,7 +40,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from edge_server.report.tuned_numbers import CUT_OFF_NS, MOST_CONTRADICTIONS
+from edge_server.report.report_constants import CUT_OFF_NS, MOST_CONTRADICTIONS
 from freshfield.ledger import LedgerReader
 
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from edge_server.report.tuned_numbers import LATE_S
+from edge_server.report.report_constants import LATE_S
 from edge_server.run_records import AgesRow, ChannelStatus, EdgeStatus, Frontier, Number, ShownRow, UpdateRow
 
 T = TypeVar("T")

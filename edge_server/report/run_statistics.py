@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from edge_server.fidelity.scorer import METRICS, SHOWN
-from edge_server.report.tuned_numbers import FINAL_SHARE
+from edge_server.report.report_constants import FINAL_SHARE
 from edge_server.run_records import (
     AgesRow,
     Baseline,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Renderer
-from edge_server.surface import tuned_numbers as tuned
+from edge_server.surface import surface_constants as tuned
 from freshfield.geometry import Pinhole
 
 Camera = tuple[NDArray[np.float64], Pinhole]

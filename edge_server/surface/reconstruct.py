@@ -10,12 +10,12 @@ import numpy as np
 
 from edge_server.fields import Renderer, View
 from edge_server.surface import SurfaceError
-from edge_server.surface import tuned_numbers as tuned
+from edge_server.surface import surface_constants as tuned
 from edge_server.surface.depth import DepthMap, render_depth_maps
 from edge_server.surface.mesh import extract_mesh, remove_small_components
 from edge_server.surface.refine_depth import on_surface, refine_depth
 from edge_server.surface.settings import MeshSettings
-from edge_server.surface.tuned_numbers import COVERING_POINTS, MIN_WEIGHT, SHARPENED_PIXELS
+from edge_server.surface.surface_constants import COVERING_POINTS, MIN_WEIGHT, SHARPENED_PIXELS
 from edge_server.surface.volume import Grid, bounding_box, fuse_maps
 
 if TYPE_CHECKING:  # of the extra surface

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.surface import SurfaceError
-from edge_server.surface import tuned_numbers as tuned
+from edge_server.surface import surface_constants as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, SIDE
 from edge_server.surface.volume import Grid, Volume, fuse_maps

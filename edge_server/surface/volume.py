@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
 from edge_server.surface import SurfaceError
-from edge_server.surface import tuned_numbers as tuned
+from edge_server.surface import surface_constants as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.fuse import CELLS, FAR, SIDE, Blocks, KernelDepth, fuse
-from edge_server.surface.tuned_numbers import MOST_VOXELS
+from edge_server.surface.surface_constants import MOST_VOXELS
 
 
 @dataclass(frozen=True)

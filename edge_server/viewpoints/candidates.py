@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edge_server.viewpoints import tuned_numbers as tuned
+from edge_server.viewpoints import viewpoint_constants as tuned
 from freshfield.geometry import Pinhole, look_at
 
 Array = NDArray[np.float64]

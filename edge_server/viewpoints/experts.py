@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.preference_model import Answer
-from edge_server.viewpoints.tuned_numbers import DETAIL_PX, OBJECT_DIFFERS
+from edge_server.viewpoints.viewpoint_constants import DETAIL_PX, OBJECT_DIFFERS
 
 Picture = NDArray[np.float32]
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import Candidates
 from edge_server.viewpoints.capture_planner import travel_m
-from edge_server.viewpoints.tuned_numbers import LIKENESS_RAD
+from edge_server.viewpoints.viewpoint_constants import LIKENESS_RAD
 
 Array = NDArray[np.float64]
 

@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.tuned_numbers import BETA1
+from edge_server.fields.common.field_constants import BETA1
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, age_corrections
 from edge_server.fields.splat.kernels.rasterize import Targets
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.registry import CaptureState
-from edge_server.viewpoints.tuned_numbers import PRIOR, RANDOM_IMAGES
+from edge_server.viewpoints.viewpoint_constants import PRIOR, RANDOM_IMAGES
 from freshfield.geometry import Pinhole
 
 

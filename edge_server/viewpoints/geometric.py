@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import Candidates
 from edge_server.viewpoints.registry import CaptureState
-from edge_server.viewpoints.tuned_numbers import ALIKE_RAD, MOST_WANTED, SAMPLES_A_SIDE, UNKNOWN_SIZE
+from edge_server.viewpoints.viewpoint_constants import ALIKE_RAD, MOST_WANTED, SAMPLES_A_SIDE, UNKNOWN_SIZE
 from freshfield.geometry import seen_from
 
 Array = NDArray[np.float64]

@@ -23,7 +23,7 @@ from edge_server.scheduler.learned.state import State, StateLayout
 from edge_server.viewpoints.candidates import Candidates, ViewpointError
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
 from edge_server.viewpoints.registry import CaptureState
-from edge_server.viewpoints.tuned_numbers import ANY_KL, CLOSED, ENTROPY, PASSES, STEP_MS
+from edge_server.viewpoints.viewpoint_constants import ANY_KL, CLOSED, ENTROPY, PASSES, STEP_MS
 from freshfield.geometry import so3_log
 
 Array = NDArray[np.float64]

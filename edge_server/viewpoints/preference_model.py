@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
-from edge_server.viewpoints.tuned_numbers import LEAST_ODDS, NEWTON_STEPS, WIDTHS
+from edge_server.viewpoints.viewpoint_constants import LEAST_ODDS, NEWTON_STEPS, WIDTHS
 
 Array = NDArray[np.float64]
 

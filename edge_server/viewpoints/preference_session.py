@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.preference_model import Answer, RewardModel, fit_reward, random_pair
-from edge_server.viewpoints.tuned_numbers import REMEMBERED, REPEAT_EVERY
+from edge_server.viewpoints.viewpoint_constants import REMEMBERED, REPEAT_EVERY
 
 KIND: Literal["freshfield preference answers"] = "freshfield preference answers"
 PERSON = "person"

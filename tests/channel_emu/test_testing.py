@@ -10,7 +10,7 @@ import grpc
 import pytest
 
 from channel_emu.live import call_flow, proxy
-from channel_emu.live import tuned_numbers as tuned
+from channel_emu.live import live_emulator_constants as tuned
 from channel_emu.testing import EmulatedLink, channel
 from tests.support import refused, wait_until
 

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from camera_node.capture import Camera
-from channel_emu.live.tuned_numbers import CREDITS
+from channel_emu.live.live_emulator_constants import CREDITS
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import Event, EventKind
 from channel_emu.model.nanoseconds import NEVER_NS

@@ -8,12 +8,12 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from edge_server.edge_constants import MOST_CARRIED
 from edge_server.embed import EmbeddingConfig
-from edge_server.fields.splat.carried_camera.tuned_numbers import LIVE_OPTIONS
+from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.machine import machine
 from edge_server.progress import ProgressLine
 from edge_server.settings import EdgeConfig, KeyframesConfig, cameras_move, read_config
-from edge_server.tuned_numbers import MOST_CARRIED
 from freshfield.scenario import ScenarioError, parse
 from freshfield.settings import Settings
 from tests.support import refused

@@ -26,7 +26,7 @@ from camera_node.clocks import ArrivalClock
 from camera_node.pose.pairing import SampleBuffer, interpolate_joints
 from camera_node.pose.providers import PoseGapError
 from camera_node.robot.arm import ArmError
-from camera_node.robot.arm import tuned_numbers as tuned
+from camera_node.robot.arm import arm_constants as tuned
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.arm.rtde_process import SAMPLE
 from freshfield.clock import Clock

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm import ArmError
-from camera_node.robot.arm.tuned_numbers import SINGULAR_DEG, SINGULAR_M
+from camera_node.robot.arm.arm_constants import SINGULAR_DEG, SINGULAR_M
 from freshfield.geometry import Array, se3_inverse, so3_log
 from freshfield.untrusted import read_text
 

@@ -16,7 +16,7 @@ import struct
 import sys
 import time
 
-from camera_node.robot.arm.tuned_numbers import CONNECT_S, POLL_SHARE
+from camera_node.robot.arm.arm_constants import CONNECT_S, POLL_SHARE
 
 SAMPLE = struct.Struct("<d6d2i")
 """Controller's time in seconds, six joint angles in radians, robot mode, safety mode."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from camera_node.robot.arm import ArmError
-from camera_node.robot.arm import tuned_numbers as tuned
+from camera_node.robot.arm import arm_constants as tuned
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.settings import PathConfig

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration import tuned_numbers as tuned
+from camera_node.robot.calibration import calibration_constants as tuned
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.targets import Corners
 from camera_node.sources.rig_calibration import calibration_entry

@@ -19,8 +19,8 @@ import numpy as np
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, rigid_transform
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.calibration_constants import MOST_QUATERNION_ERROR
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
-from camera_node.robot.calibration.tuned_numbers import MOST_QUATERNION_ERROR
 from freshfield.geometry import quaternion_to_matrix, se3, se3_inverse
 from freshfield.untrusted import UntrustedError, read_json, read_text, read_yaml
 

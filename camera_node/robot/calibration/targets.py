@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration import tuned_numbers as tuned
+from camera_node.robot.calibration import calibration_constants as tuned
 from freshfield.geometry import Array, Pinhole, se3
 
 GrayImage = NDArray[np.uint8]

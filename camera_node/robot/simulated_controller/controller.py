@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.simulated_controller import tuned_numbers as tuned
+from camera_node.robot.simulated_controller import simulated_controller_constants as tuned
 from camera_node.robot.simulated_controller.joint_motion import STEP_S, JointMotion
 from freshfield.geometry import Array
 

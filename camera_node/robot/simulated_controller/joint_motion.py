@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.simulated_controller import tuned_numbers as tuned
+from camera_node.robot.simulated_controller import simulated_controller_constants as tuned
 from freshfield.geometry import Array
 
 STEP_S = 0.002

@@ -20,7 +20,7 @@ from collections.abc import Awaitable, Callable
 
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller import rtde_protocol as rtde
-from camera_node.robot.simulated_controller import tuned_numbers as tuned
+from camera_node.robot.simulated_controller import simulated_controller_constants as tuned
 from camera_node.robot.simulated_controller.controller import Controller
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
 from freshfield.clock import Clock

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from camera_node.robot.arm.kinematics import ArmModel, pose_difference
-from camera_node.robot.teleop import tuned_numbers as tuned
+from camera_node.robot.teleop import teleop_constants as tuned
 from camera_node.robot.teleop.settings import TeleopConfig
 from freshfield.geometry import Array
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.teleop import tuned_numbers as tuned
+from camera_node.robot.teleop import teleop_constants as tuned
 from camera_node.robot.teleop.settings import TeleopConfig
 from freshfield.geometry import Array
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from camera_node.robot.teleop import tuned_numbers as tuned
+from camera_node.robot.teleop import teleop_constants as tuned
 from freshfield.geometry import Array, quaternion_multiply, quaternion_to_matrix, slerp, so3_log
 
 

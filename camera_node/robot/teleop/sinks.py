@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.arm_constants import STOP_RAD_S2
 from camera_node.robot.arm.control import connect_control, joints_in_motion, stop_within_timeout
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.tuned_numbers import STOP_RAD_S2
+from camera_node.robot.teleop.teleop_constants import LOOKAHEAD_S, MAX_LAG_RAD, SERVO_GAIN
 from camera_node.robot.teleop.teleoperator import Command
-from camera_node.robot.teleop.tuned_numbers import LOOKAHEAD_S, MAX_LAG_RAD, SERVO_GAIN
 
 HEADER = "t_s,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_m,y_m,z_m,state"
 

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 
 from camera_node.robot.arm import ArmError
-from camera_node.robot.teleop import tuned_numbers as tuned
+from camera_node.robot.teleop import teleop_constants as tuned
 from freshfield.geometry import Array, matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
 
 log = logging.getLogger("camera-node.teleop")

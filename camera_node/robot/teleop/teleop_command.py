@@ -17,7 +17,7 @@ from camera_node.robot.arm.control import confirm_motion, open_stream, stop_even
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
 from camera_node.robot.simulated_controller.controller import HOME_RAD
-from camera_node.robot.teleop import tuned_numbers as tuned
+from camera_node.robot.teleop import teleop_constants as tuned
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus, open_stylus

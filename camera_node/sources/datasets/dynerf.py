@@ -17,7 +17,7 @@ from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
 from camera_node.sources.datasets.video import Clip, rig_dataset
 from camera_node.sources.rig_calibration import CalibratedCamera
-from camera_node.sources.tuned_numbers import SAME_SHAPE
+from camera_node.sources.source_constants import SAME_SHAPE
 from freshfield.geometry import Pinhole, Pose
 
 POSES = "poses_bounds.npy"

@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.datasets.records import DatasetError, Image
 from freshfield import payload  # sets OpenCV's size limit before cv2 is imported
 from freshfield.geometry import Pinhole

@@ -15,7 +15,7 @@ from typing import TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.datasets.records import DatasetError
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.geometry import Array, Pinhole, invertible

@@ -22,7 +22,7 @@ from camera_node.sources.datasets.records import (
     file_within,
     missing_note,
 )
-from camera_node.sources.tuned_numbers import SAME_SHAPE
+from camera_node.sources.source_constants import SAME_SHAPE
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose

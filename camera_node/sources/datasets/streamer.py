@@ -22,7 +22,7 @@ from camera_node.settings import FPS_RANGE, RecordedConfig, VideoConfig, find_da
 from camera_node.sources.base import Shot, Source, assign_cameras, rate
 from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
-from camera_node.sources.tuned_numbers import HOLD_OUT_EVERY, PHOTO_FPS
+from camera_node.sources.source_constants import HOLD_OUT_EVERY, PHOTO_FPS
 from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose

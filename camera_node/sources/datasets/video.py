@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.base import rate
 from camera_node.sources.datasets.image_reading import as_image, resize, shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions

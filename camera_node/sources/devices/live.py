@@ -18,7 +18,7 @@ from functools import partial
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
 from camera_node.settings import LiveConfig, beside
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.base import Shot, Source, rate
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
 from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration

@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from camera_node.settings import OakConfig
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.devices.feed import CameraError, Feed, Image, Plugged, intrinsics_or_reason, select_device
 from freshfield.clock import Clock
 from freshfield.depth import DepthImage

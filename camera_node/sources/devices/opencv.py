@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from camera_node.settings import CameraConfig
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.devices.feed import CameraError, Feed, Image
 from freshfield.clock import Clock
 

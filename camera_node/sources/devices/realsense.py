@@ -19,7 +19,7 @@ import numpy as np
 
 from camera_node.clocks import ArrivalClock
 from camera_node.settings import RealsenseConfig
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.devices.feed import (
     CameraError,
     Feed,

@@ -19,7 +19,7 @@ import camera_node
 import channel_emu
 import edge_server
 import freshfield
-from edge_server.experiments.engine.tuned_numbers import ASIDE
+from edge_server.experiments.engine.engine_constants import ASIDE
 from edge_server.machine import versions
 from freshfield.plugins import files_named
 

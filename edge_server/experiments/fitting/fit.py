@@ -17,7 +17,7 @@ from msgspec.structs import asdict
 from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still, score_views
@@ -29,7 +29,7 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Scorer
 from edge_server.fields import Budget, FitReport, RefinesCameras, checkpoint
 from edge_server.fields.registry import FIELD, make_field, option_help
-from edge_server.fields.splat.carried_camera.tuned_numbers import scan_options
+from edge_server.fields.splat.carried_camera.carried_camera_constants import scan_options
 from edge_server.machine import run_facts
 from edge_server.run_records import UpdateRow
 from freshfield.files import write_json

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field, RefinesCameras, View

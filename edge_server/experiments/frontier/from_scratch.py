@@ -11,9 +11,9 @@ from typing import Any
 
 from camera_node.synthetic.scene import SCENES
 from edge_server.experiments.common.tables import median_or_none, over_seeds
+from edge_server.experiments.experiment_constants import SCORED_OF_TRAINING
 from edge_server.experiments.scenes.multiview_still import WHITE, score_views, synthetic_still
 from edge_server.experiments.scenes.recorded import MultiviewStill, load_recorded
-from edge_server.experiments.tuned_numbers import SCORED_OF_TRAINING
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import PerceptualMetric, Scorer
 from edge_server.fields import Budget

@@ -15,6 +15,7 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import add_lpips, add_workers, at_least, parse_options
 from edge_server.experiments.engine import Engine, EngineError
+from edge_server.experiments.experiment_constants import LAYERS_S
 from edge_server.experiments.frontier import from_scratch, update_time
 from edge_server.experiments.frontier.from_scratch import Fit, Still
 from edge_server.experiments.frontier.output import recommendation, write_output
@@ -27,7 +28,6 @@ from edge_server.experiments.frontier.update_time import (
     field_label,
     variants,
 )
-from edge_server.experiments.tuned_numbers import LAYERS_S
 from edge_server.fidelity.lpips_weights import open_lpips, weights_folder
 from edge_server.fields.registry import FIELD, field_names, make_field
 from edge_server.machine import machine, versions

@@ -19,10 +19,10 @@ import numpy as np
 
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, over_seeds
+from edge_server.experiments.experiment_constants import FRONTIER_COSTS_S, FRONTIER_LEAD_S, STATIC_STEPS_PER_S
 from edge_server.experiments.rollouts.episode import EpisodeFactory
 from edge_server.experiments.rollouts.rollout import named, rollout
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.tuned_numbers import FRONTIER_COSTS_S, FRONTIER_LEAD_S, STATIC_STEPS_PER_S
 from edge_server.experiments.virtual import costs_command
 from edge_server.fields.registry import option_help
 from edge_server.settings import LEAST_UPDATE_MS, ComputeConfig

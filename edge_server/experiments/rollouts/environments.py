@@ -23,7 +23,7 @@ from edge_server.experiments.rollouts.rollout import choose
 from edge_server.experiments.rollouts.setting import Setting, layout_of, reward_of
 from edge_server.scheduler import Policy
 from edge_server.scheduler.fixed import freshest
-from edge_server.scheduler.learned.tuned_numbers import FEATURE_LIMIT, OMEGAS_MS
+from edge_server.scheduler.learned.learning_constants import FEATURE_LIMIT, OMEGAS_MS
 from edge_server.scheduler.policy import Epoch, SelectionWindow
 from edge_server.scheduler.wait import Wait
 from edge_server.settings import read_config

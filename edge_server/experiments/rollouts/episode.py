@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera_node.capture import Camera
 from camera_node.settings import WorldConfig, source_config
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.setting import Setting

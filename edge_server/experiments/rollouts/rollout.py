@@ -20,9 +20,9 @@ import numpy as np
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.engine import Engine
+from edge_server.experiments.experiment_constants import SHOWN_EVERY_MS
 from edge_server.experiments.rollouts.episode import SCORES, Choice, Episode, EpisodeFactory, Outcome
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.tuned_numbers import SHOWN_EVERY_MS
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.scheduler import BANDIT, Epoch, Policy, make_policy, parse_policy

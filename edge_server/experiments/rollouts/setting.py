@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from msgspec import structs
 
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import StateLayout

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from camera_node.synthetic import SCENES, make_scene
 from camera_node.synthetic.scene import HELD_OUT, Scene
-from camera_node.synthetic.tuned_numbers import WORLD_FPS
-from edge_server.experiments import tuned_numbers as tuned
+from camera_node.synthetic.synthetic_constants import WORLD_FPS
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.scenes.captures import SUFFIXES, load_captures
 from edge_server.experiments.scenes.recorded import MultiviewStill, load_recorded

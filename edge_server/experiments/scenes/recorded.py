@@ -8,7 +8,7 @@ from pathlib import Path
 
 from camera_node.sources.datasets.formats import open_dataset
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.fidelity.images import BLACK, Color
 from edge_server.fields import View
 

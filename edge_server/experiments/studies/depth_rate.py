@@ -14,8 +14,8 @@ from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.studies.drawing import curves
 from edge_server.experiments.studies.study import Study, StudyRequest, open_engine
+from edge_server.experiments.studies.study_constants import DEPTH_SCORED_FROM, DEPTH_SECONDS
 from edge_server.experiments.studies.trial import scenario_of, scene_label, scenes_here
-from edge_server.experiments.studies.tuned_numbers import DEPTH_SCORED_FROM, DEPTH_SECONDS
 from edge_server.experiments.studies.verdicts import Claim, better
 from edge_server.experiments.virtual.from_scenario import build_deployment, training_cameras
 from edge_server.experiments.virtual.simulate_command import usual_settings

@@ -14,17 +14,17 @@ from typing import Any
 
 from edge_server.experiments.common.seed_table import TRAINING, Row
 from edge_server.experiments.engine.content_key import code_digest
+from edge_server.experiments.experiment_constants import QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.experiments.rollouts.setting import Setting, layout_of, reward_of, seeds
 from edge_server.experiments.studies.study import StudyRequest, open_engine
+from edge_server.experiments.studies.study_constants import TRAININGS
 from edge_server.experiments.studies.trial import Trial
-from edge_server.experiments.studies.tuned_numbers import TRAININGS
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
 from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.trainer import TrainingConfig, read_log, train
-from edge_server.experiments.tuned_numbers import QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.learner_spec import Action, Spec
-from edge_server.scheduler.learned.tuned_numbers import OMEGAS_MS
+from edge_server.scheduler.learned.learning_constants import OMEGAS_MS
 
 SIZE = 64
 FOUR_VIEWPOINTS = ("cam00", "cam04", "cam09", "cam17")

@@ -13,8 +13,8 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.common.tables import markdown_table
 from edge_server.experiments.engine import Engine
+from edge_server.experiments.experiment_constants import FALSE_DISCOVERY_RATE
 from edge_server.experiments.studies.verdicts import DOES_NOT_HOLD, HOLDS, UNDECIDED, Claim, Verdict, judge
-from edge_server.experiments.tuned_numbers import FALSE_DISCOVERY_RATE
 from edge_server.machine import commit
 from edge_server.progress import ProgressLine
 from freshfield.files import write_csv, write_text

@@ -20,7 +20,7 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.episode import Stage, open_stage
-from edge_server.experiments.studies import tuned_numbers as tuned
+from edge_server.experiments.studies import study_constants as tuned
 from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings

@@ -25,8 +25,8 @@ from edge_server.experiments.common.statistics import (
     paired,
 )
 from edge_server.experiments.common.tables import number
-from edge_server.experiments.studies.tuned_numbers import LEAST_DB
-from edge_server.scheduler.learned.tuned_numbers import W_S
+from edge_server.experiments.studies.study_constants import LEAST_DB
+from edge_server.scheduler.learned.learning_constants import W_S
 
 NO_DELAY, USE_ALL = "no delay", "all"
 HOLDS, DOES_NOT_HOLD, UNDECIDED = "holds", "does not hold", "undecided"

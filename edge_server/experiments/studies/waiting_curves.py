@@ -7,8 +7,8 @@ from typing import Any
 from edge_server.experiments.common.seed_table import Row, SeedTable
 from edge_server.experiments.studies.drawing import curves, instants
 from edge_server.experiments.studies.study import Study, StudyRequest
+from edge_server.experiments.studies.study_constants import PLATEAU_NEAR
 from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep, usual_trial
-from edge_server.experiments.studies.tuned_numbers import PLATEAU_NEAR
 from edge_server.experiments.studies.verdicts import Claim, better, interior, plateau, trend
 
 OMEGAS = (15.0, 30.0, 45.0, 60.0, 75.0, 90.0, 105.0, 120.0, 160.0, 240.0)

@@ -14,13 +14,13 @@ from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import PerSeed, Row
 from edge_server.experiments.common.tables import complete_mean
 from edge_server.experiments.engine import Engine
+from edge_server.experiments.experiment_constants import EVALUATION_FITS
 from edge_server.experiments.rollouts.episode import Outcome, mean_outcome
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting
-from edge_server.experiments.tuned_numbers import EVALUATION_FITS
 from edge_server.scheduler.learned.actor import Actor
+from edge_server.scheduler.learned.learning_constants import OMEGAS_MS
 from edge_server.scheduler.learned.rewards import Reward
-from edge_server.scheduler.learned.tuned_numbers import OMEGAS_MS
 
 At = tuple[int, int]
 """Seed of an episode and number of a decision."""

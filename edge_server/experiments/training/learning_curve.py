@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.experiments.tuned_numbers import SMOOTHED_BATCHES
+from edge_server.experiments.experiment_constants import SMOOTHED_BATCHES
 from edge_server.report.style import CYCLE, figure, label_lines
 
 

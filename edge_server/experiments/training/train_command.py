@@ -13,14 +13,14 @@ from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import add_folders, add_workers, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
+from edge_server.experiments.experiment_constants import QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.experiments.rollouts.setting import Setting, layout_of, reward_of, seeds
 from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
-from edge_server.experiments.tuned_numbers import QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.scheduler import BANDIT, STATE_PARTS
 from edge_server.scheduler.learned.learner_spec import ACTIONS, Spec
+from edge_server.scheduler.learned.learning_constants import OMEGAS_MS
 from edge_server.scheduler.learned.rewards import REWARDS
-from edge_server.scheduler.learned.tuned_numbers import OMEGAS_MS
 from edge_server.settings import read_config
 from freshfield.files import out_folder, write_csv
 from freshfield.scenario import Scenario, ScenarioError, load

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.viewpoints.reconstructions import identity, sprites, taste_score, varied_plans
 from edge_server.experiments.viewpoints.stage import Stage

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.fidelity.images import to_bytes, to_unit
 from edge_server.fields import Field

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from camera_node.settings import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
 from camera_node.synthetic.scene import Scene
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+from edge_server.experiments.experiment_constants import HELD_OUT_VIEWPOINTS, NEAR_OF_RADIUS, STAGE_EMBEDDING_DIM
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.experiments.tuned_numbers import HELD_OUT_VIEWPOINTS, NEAR_OF_RADIUS, STAGE_EMBEDDING_DIM
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fidelity.images import BLACK, Color, to_bytes, to_unit
 from edge_server.fidelity.scorer import Score, Scorer

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
-from edge_server.experiments.tuned_numbers import PLANNED_VIEWS
+from edge_server.experiments.experiment_constants import PLANNED_VIEWS
 from edge_server.experiments.viewpoints.asking import ANSWERS, compare
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage

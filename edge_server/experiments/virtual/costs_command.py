@@ -20,7 +20,7 @@ from scipy.optimize import nnls
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings

@@ -11,7 +11,7 @@ from camera_node.capture import Camera, build_cameras
 from camera_node.settings import SourceConfig, WorldConfig, errors_of, source_config
 from camera_node.synthetic import Scene, make_scene
 from channel_emu.model.settings import channel_from_mapping
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.truth import CapturedTruth, ExactTruth, Truth
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec.structs import asdict
 
 from camera_node.capture import Camera
-from edge_server.experiments.tuned_numbers import RESCORED_EVERY_S, RESCORES_COUNT_FROM_S
+from edge_server.experiments.experiment_constants import RESCORED_EVERY_S, RESCORES_COUNT_FROM_S
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fidelity.so_far import score_frame, so_far

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from edge_server.live.tuned_numbers import LEAST_TAKEN
+from edge_server.live.live_constants import LEAST_TAKEN
 from edge_server.settings import ComputeConfig
 
 _FREE = ComputeConfig()

@@ -23,7 +23,7 @@ from edge_server.experiments.common.arguments import add_folders, at_least, fold
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
-from edge_server.experiments.tuned_numbers import CYCLE_MS, PROGRESS_EVERY_S, SCORED_EVERY_MS
+from edge_server.experiments.experiment_constants import CYCLE_MS, PROGRESS_EVERY_S, SCORED_EVERY_MS
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.now_and_all import NowAndAll
 from edge_server.experiments.virtual.run_settings import RunSettings

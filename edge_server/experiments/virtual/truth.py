@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from camera_node.capture import Camera
 from camera_node.sources.base import Shot
-from edge_server.experiments.tuned_numbers import NOISE_FRAMES
+from edge_server.experiments.experiment_constants import NOISE_FRAMES
+from edge_server.fidelity.fidelity_constants import MOVING_BOUND, MOVING_LAGS_MS
 from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
-from edge_server.fidelity.tuned_numbers import MOVING_BOUND, MOVING_LAGS_MS
 from edge_server.fields import View
 from freshfield import payload
 from freshfield.geometry import Pinhole

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common import tuned_numbers as tuned
+from edge_server.fields.common import field_constants as tuned
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.plane_sweep import NOT_SEEN, SEES, UNMARKED, score_cells, sweep_rays
 from edge_server.fields.common.kernels.rays import Views

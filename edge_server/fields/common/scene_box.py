@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common import tuned_numbers as tuned
+from edge_server.fields.common import field_constants as tuned
 from freshfield.geometry import converging_point
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIPS, SU
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step
 from edge_server.fields.splat.kernels.project import BLOCK, FOOTPRINT, PROJECTED, TILE, Gaussians, project
 from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, ROWS, Raster, Targets, train_tiles
-from edge_server.fields.splat.tuned_numbers import MAX_PAIRS
+from edge_server.fields.splat.splat_constants import MAX_PAIRS
 
 
 class RasterBuffers:

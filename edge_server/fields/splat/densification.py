@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.splat import tuned_numbers as tuned
+from edge_server.fields.splat import splat_constants as tuned
 from edge_server.fields.splat.kernels.optimizer_step import DEAD, OptimizerState, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, SH_COLUMNS, Gaussians
 from edge_server.fields.splat.settings import SplatSettings

@@ -26,7 +26,7 @@ from edge_server.fields.common.stepped_field import Step, SteppedField
 from edge_server.fields.common.supervision import supervising_views
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.common.view_store import Arrays, same_views
-from edge_server.fields.splat import tuned_numbers as tuned
+from edge_server.fields.splat import splat_constants as tuned
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians

@@ -14,7 +14,7 @@ from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
 from edge_server.fields.splat.kernels.project import DEPTH, QUATERNION, RED, SCALE, Gaussians
 from edge_server.fields.splat.kernels.rasterize import render_tiles
-from edge_server.fields.splat.tuned_numbers import ASPECT, STEEPEST
+from edge_server.fields.splat.splat_constants import ASPECT, STEEPEST
 from freshfield.geometry import Pinhole, quaternion_normalize, quaternion_to_matrix
 
 

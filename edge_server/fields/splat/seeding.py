@@ -16,7 +16,13 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, SH_COLUMNS
 from edge_server.fields.splat.settings import SplatSettings
-from edge_server.fields.splat.tuned_numbers import SEED_CANDIDATES, SEED_MOST_SEE, SEED_OPACITY, SEED_SCALE, SEED_VIEWS
+from edge_server.fields.splat.splat_constants import (
+    SEED_CANDIDATES,
+    SEED_MOST_SEE,
+    SEED_OPACITY,
+    SEED_SCALE,
+    SEED_VIEWS,
+)
 
 
 def seed_gaussians(

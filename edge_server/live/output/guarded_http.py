@@ -12,7 +12,7 @@ from socketserver import ThreadingMixIn
 from typing import Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from freshfield.access import HttpDoor, HttpRefused
 from freshfield.limits import MAX_SCRAPES, SCRAPE_TIMEOUT_S
 from freshfield.transport import Transport, TransportError

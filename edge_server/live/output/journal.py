@@ -21,7 +21,7 @@ import msgspec
 from msgspec.structs import asdict
 
 from edge_server.fidelity.scorer import SHOWN, Score
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.state import Publication
 from edge_server.run_records import AgeParts, AgesRow, ShownRow, SoFarScores
 from freshfield.files import Lines, write_json

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.state import Publication
 from freshfield.session import DECISIONS, SCORES
 from freshfield.v1 import frames_pb2 as pb

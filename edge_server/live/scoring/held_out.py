@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fidelity.fidelity_constants import MOVING_BOUND, MOVING_LAGS_MS
 from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags
 from edge_server.fidelity.refined import render_refined, with_refined
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fidelity.so_far import FrameScore, score_frame, stays
-from edge_server.fidelity.tuned_numbers import MOVING_BOUND, MOVING_LAGS_MS
 from edge_server.fields import Snapshot, View
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.state import Publication
 from freshfield import payload
 from freshfield.frame import Frame

@@ -26,7 +26,7 @@ from edge_server.fidelity.images import to_bytes
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fidelity.so_far import FrameScore, so_far
 from edge_server.fields import Snapshot, View
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.live.scoring.held_out import HeldOutCamera, Scored, Truth
 from edge_server.live.state import Comparison, Publication
 from edge_server.run_records import Baseline, SoFarScores

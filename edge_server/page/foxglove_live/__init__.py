@@ -31,11 +31,11 @@ from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSIT
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.live.state import CameraView, EdgeState, Publication
-from edge_server.page.foxglove_live import tuned_numbers as tuned
+from edge_server.page.foxglove_live import foxglove_constants as tuned
+from edge_server.page.page_constants import PICTURE_JPEG_QUALITY
 from edge_server.page.page_thread import PageThread
 from edge_server.page.rendering import browser_image
 from edge_server.page.splats.records import weights
-from edge_server.page.tuned_numbers import PICTURE_JPEG_QUALITY
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose

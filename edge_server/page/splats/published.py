@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.layers import tuned_numbers as layers
+from edge_server.fields.splat.layers import layer_constants as layers
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
 from edge_server.fields.splat.snapshot import SplatSnapshot
-from edge_server.page.splats import tuned_numbers as tuned
+from edge_server.page.splats import browser_splat_constants as tuned
 from edge_server.page.splats.messages import MOST_ANCHORS, KnotsBlock, MovingBlock, SceneBlock
 from edge_server.page.splats.records import scale_range, to_records, weights
 

@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE
 from edge_server.fields.splat.planar import unit_quaternions
-from edge_server.fields.splat.tuned_numbers import LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
+from edge_server.fields.splat.splat_constants import LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
 
 RECORD = np.dtype([("place", "<u2", 3), ("scale", "u1", 3), ("turn", "u1", 3), ("color", "u1", 3), ("alpha", "u1")])
 ZONE = np.sqrt(2.0) - 1.0
 COLOR_LOW, COLOR_STEP = -0.5, 2.0 / 255
-"""Colors of Gaussians may leave [0, 1] by half (``COLOR_LOW`` in ``fields.splat.tuned_numbers``)."""
+"""Colors of Gaussians may leave [0, 1] by half (``COLOR_LOW`` in ``fields.splat.splat_constants``)."""
 PLACE_STEP, TURN_STEP = 4.0 / 65535, 2.0 * ZONE / 255
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.page.splats import tuned_numbers as tuned
+from edge_server.page.splats import browser_splat_constants as tuned
 from edge_server.page.splats.messages import (
     MovingBlock,
     StaticBlock,

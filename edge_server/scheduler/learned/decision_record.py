@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import checkpoint
-from edge_server.scheduler.learned import tuned_numbers as tuned
+from edge_server.scheduler.learned import learning_constants as tuned
 from edge_server.scheduler.learned.actor import Actor, Decision
 from edge_server.scheduler.learned.state import State
 from freshfield import payload

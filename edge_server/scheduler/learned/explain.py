@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler.learned import tuned_numbers as tuned
+from edge_server.scheduler.learned import learning_constants as tuned
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.state import State
 

@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from edge_server.scheduler.learned import tuned_numbers as tuned
+from edge_server.scheduler.learned import learning_constants as tuned
 from edge_server.scheduler.learned.state import StateLayout, require_int
 from freshfield import limits
 from freshfield.limits import LONGEST_MS

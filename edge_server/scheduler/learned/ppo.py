@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
+from edge_server.scheduler.learned import learning_constants as tuned
 from edge_server.scheduler.learned import networks
-from edge_server.scheduler.learned import tuned_numbers as tuned
 from edge_server.scheduler.learned.actor import KIND, Actor, read_spec
 from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
 from edge_server.scheduler.learned.learner_spec import Spec

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, Literal
 
-from edge_server.scheduler.learned import tuned_numbers as tuned
+from edge_server.scheduler.learned import learning_constants as tuned
 
 TERMS = ("psnr", "ssim", "distance", "age", "views")
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.scheduler.learned import tuned_numbers as tuned
+from edge_server.scheduler.learned import learning_constants as tuned
 from freshfield import limits
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.surface import tuned_numbers as tuned
+from edge_server.surface import surface_constants as tuned
 from edge_server.surface.kernels.lens import distort
 
 SIDE = 8  # voxels per side of a block

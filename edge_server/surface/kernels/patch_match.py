@@ -15,7 +15,7 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
-from edge_server.surface import tuned_numbers as tuned
+from edge_server.surface import surface_constants as tuned
 from edge_server.surface.kernels.patch_images import depth_shown, offset_to, project, within
 
 LANES = 32  # taps of a patch: 5 x 5 and four farther ones; the rest weigh nothing

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from camera_node import tuned_numbers as tuned
+from camera_node import node_constants as tuned
 from camera_node.synthetic import SCENES, frame_cache, make_scene
 from camera_node.synthetic import source as source_module
 from camera_node.synthetic.depth import DepthRenderer

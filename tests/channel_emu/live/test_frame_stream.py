@@ -13,13 +13,13 @@ import grpc.aio
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
+from channel_emu.live import live_emulator_constants as tuned
 from channel_emu.live import live_link
-from channel_emu.live import tuned_numbers as tuned
 from channel_emu.live.camera_stream import PUSH
 from channel_emu.live.frame_proxy import SET_BY_HAND
+from channel_emu.live.live_emulator_constants import CREDITS
 from channel_emu.live.live_link import Message
 from channel_emu.live.proxy import EmulatorFailed
-from channel_emu.live.tuned_numbers import CREDITS
 from channel_emu.model import trace
 from channel_emu.model.chain import ChainError
 from channel_emu.model.channel import Channel

@@ -8,9 +8,9 @@ from collections.abc import AsyncIterator
 import numpy as np
 import pytest
 
+from channel_emu.live.live_emulator_constants import PIECE_BYTES, PIECES_BEHIND, RESEND_AFTER_S
 from channel_emu.live.proxy import ProxyOptions
 from channel_emu.live.tcp_proxy import TcpProxy
-from channel_emu.live.tuned_numbers import PIECE_BYTES, PIECES_BEHIND, RESEND_AFTER_S
 from channel_emu.model.settings import channel_from_mapping
 from freshfield.transport import TransportError
 from tests.support import free_port, until

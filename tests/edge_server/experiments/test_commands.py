@@ -9,7 +9,7 @@ import yaml
 
 from edge_server.cli import main
 from edge_server.experiments import compare_command
-from edge_server.experiments import tuned_numbers as tuned
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable

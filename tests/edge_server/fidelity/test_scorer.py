@@ -13,13 +13,13 @@ from edge_server.cli import main as edge_server
 from edge_server.fidelity import fetch_lpips_command, lpips_network
 from edge_server.fidelity.baselines import BaselineMean, baseline, mean_color_db, nearest_view, view_db
 from edge_server.fidelity.fetch_lpips_command import FetchError, convert
+from edge_server.fidelity.fidelity_constants import MOVING_BOUND, PSNR_CEILING_DB
 from edge_server.fidelity.images import ImageError
 from edge_server.fidelity.lpips_weights import FILES, FOLDER_VARIABLE, open_lpips, weights_folder
 from edge_server.fidelity.moving_pixels import NoiseEstimate, frames_at_lags, moving_mask
 from edge_server.fidelity.psnr import psnr
 from edge_server.fidelity.scorer import Scorer, mean_score
 from edge_server.fidelity.ssim import ssim
-from edge_server.fidelity.tuned_numbers import MOVING_BOUND, PSNR_CEILING_DB
 from edge_server.fields import View
 from edge_server.run_records import Baseline
 from freshfield.geometry import Pinhole, look_at

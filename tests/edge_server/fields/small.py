@@ -14,8 +14,8 @@ import pytest
 from msgspec import structs
 
 from edge_server.fields import Budget, View
+from edge_server.fields.common.field_constants import PARAMETER_LIMIT
 from edge_server.fields.common.threads.thread_pool import CallerPool
-from edge_server.fields.common.tuned_numbers import PARAMETER_LIMIT
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 from edge_server.fields.ngp.field import NgpField
@@ -23,7 +23,7 @@ from edge_server.fields.ngp.settings import NgpSettings
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.settings import SplatSettings
-from edge_server.fields.splat.tuned_numbers import ASPECT, POSITION_LIMIT, RAW_OPACITY_LIMIT
+from edge_server.fields.splat.splat_constants import ASPECT, POSITION_LIMIT, RAW_OPACITY_LIMIT
 from edge_server.fields.tensorf.field import TensorfField
 from edge_server.fields.tensorf.settings import TensorfSettings
 from tests.edge_server.fields.scenes import picture, psnr, ring

@@ -52,7 +52,7 @@ def test_compiled_kernels_are_kept_apart_for_every_state_of_the_sources(tmp_path
     assert cache_folder(tmp_path) == first
     source.write_text("x = 2")
     second = cache_folder(tmp_path)
-    (source.parents[1] / "tuned_numbers.py").write_text("NUMBER = 1")  # which kernels hold as a constant
+    (source.parents[1] / "field_constants.py").write_text("NUMBER = 1")  # which kernels hold as a constant
     assert len({first, second, cache_folder(tmp_path)}) == 3
     monkeypatch.delenv("NUMBA_CACHE_DIR")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))

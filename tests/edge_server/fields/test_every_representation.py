@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget
-from edge_server.fields.common.cameras import tuned_numbers as refinement
+from edge_server.fields.common.cameras import camera_refinement_constants as refinement
 from edge_server.fields.common.kernels.volume_rendering import Weights
 from edge_server.fields.common.supervision import pack_cameras
 from tests.edge_server.fields import small as made

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import pytest
 
 from edge_server.live.buffer import FrameBuffer
-from edge_server.live.tuned_numbers import MOST_UNSELECTED
+from edge_server.live.live_constants import MOST_UNSELECTED
 from freshfield.frame import Frame
 from tests.edge_server.frames import frame
 

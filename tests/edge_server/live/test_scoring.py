@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge_server.fidelity.fidelity_constants import SO_FAR_FRAMES
 from edge_server.fidelity.psnr import PSNR_CEILING_DB
 from edge_server.fidelity.scorer import Score, Scorer
-from edge_server.fidelity.tuned_numbers import SO_FAR_FRAMES
 from edge_server.fields import Rendering, View
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
+from edge_server.live.live_constants import MOST_PENDING
 from edge_server.live.scoring import scoring_thread
 from edge_server.live.scoring.held_out import HeldOutCamera
 from edge_server.live.scoring.scoring_thread import ScoringThread
 from edge_server.live.state import Publication
-from edge_server.live.tuned_numbers import MOST_PENDING
 from freshfield import payload
 from freshfield.frame import Frame
 from freshfield.geometry import Pinhole, Pose

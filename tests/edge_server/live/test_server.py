@@ -22,11 +22,11 @@ import pytest
 from edge_server.cli import main as edge_server
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
+from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
-from edge_server.fields.splat.carried_camera.tuned_numbers import LIVE_OPTIONS
+from edge_server.live.live_constants import MAX_SNAPSHOTS, STOP_S
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
-from edge_server.live.tuned_numbers import MAX_SNAPSHOTS, STOP_S
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.learner_spec import Spec
@@ -40,7 +40,7 @@ from freshfield.ledger import read_all
 from freshfield.limits import MAX_SCRAPES, MAX_WATCHERS
 from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
-from freshfield_up.tuned_numbers import GRACE_S
+from freshfield_up.launcher_constants import GRACE_S
 from tests.edge_server.frames import TINY, frame
 from tests.support import free_port, refused, wait_until
 

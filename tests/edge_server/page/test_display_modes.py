@@ -12,7 +12,7 @@ from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison
 from edge_server.page import colors, display_modes
 from edge_server.page.colors import FRESH, MIDDLE, STALE, UNKNOWN, age_color, age_colors
-from edge_server.page.tuned_numbers import FRESH_MS, STALE_MS
+from edge_server.page.page_constants import FRESH_MS, STALE_MS
 from edge_server.page.viewpoint import initial_viewpoint, row_band, visitor_camera
 from freshfield.geometry import Pinhole, Pose, look_at, matrix_to_quaternion, quaternion_to_matrix
 from tests.edge_server.frames import frame

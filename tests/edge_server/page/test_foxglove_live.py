@@ -21,7 +21,7 @@ from edge_server.cli import main as edge_server
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.page.foxglove_live import FoxgloveServer, point_cloud
-from edge_server.page.foxglove_live.tuned_numbers import MOST_POINTS
+from edge_server.page.foxglove_live.foxglove_constants import MOST_POINTS
 from freshfield.transport import TransportError
 from tests.conftest import ROOT
 from tests.edge_server.page.preview import CAMERAS, LENS, Preview

@@ -10,8 +10,8 @@ from edge_server.live.state import CameraView, Publication
 from edge_server.page import markup, timelines
 from edge_server.page.colors import FRESH, HELD_OUT, STALE, css, scale_color
 from edge_server.page.diagnosis import poor_picture
+from edge_server.page.page_constants import CHART_POINTS, FLAT_SCORES
 from edge_server.page.timelines import History
-from edge_server.page.tuned_numbers import CHART_POINTS, FLAT_SCORES
 from edge_server.run_records import Frontier, FrontierPoint, age_parts_ms
 from tests.edge_server.page.preview import publication
 

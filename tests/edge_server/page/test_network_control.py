@@ -8,7 +8,7 @@ import pytest
 
 from edge_server.page import start_page
 from edge_server.page.network_control import EmulatorControl, NetworkControl
-from edge_server.page.tuned_numbers import MAX_SLIDER_DELAY_MS
+from edge_server.page.page_constants import MAX_SLIDER_DELAY_MS
 from freshfield.transport import Transport
 from tests.channel_emu.live.emulator import emulate
 from tests.edge_server.page.preview import bare_state

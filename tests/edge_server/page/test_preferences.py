@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from edge_server.live import tuned_numbers as tuned
+from edge_server.live import live_constants as tuned
 from edge_server.page import PageError
 from edge_server.page.preferences import PreferencePage
 from edge_server.viewpoints.preference_session import PreferenceSession

@@ -15,9 +15,9 @@ from edge_server.report.build_report import assemble, build_report
 from edge_server.report.conclusion import conclusion
 from edge_server.report.events import silences
 from edge_server.report.figures import draw_ages, draw_fidelity, draw_frontier
+from edge_server.report.report_constants import MOST_EVENTS
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.report.run_statistics import SERIES, fidelity, updates
-from edge_server.report.tuned_numbers import MOST_EVENTS
 from edge_server.run_records import AgesRow, EdgeStatus, UpdateCounts, UpdateRow
 from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield.untrusted import read_json

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.fuse import FAR, SIDE
-from edge_server.surface.tuned_numbers import CLOSE, FREE
+from edge_server.surface.surface_constants import CLOSE, FREE
 from edge_server.surface.volume import Grid, Volume
 from freshfield.geometry import Pinhole, look_at, world_rays
 

@@ -6,7 +6,7 @@ import torch
 
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.surface import SurfaceError
-from edge_server.surface import tuned_numbers as tuned
+from edge_server.surface import surface_constants as tuned
 from edge_server.surface import volume as volume_module
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.fuse import SIDE

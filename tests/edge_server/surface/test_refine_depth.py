@@ -9,14 +9,14 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 
 from edge_server.fields import Rendering, View
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.surface import tuned_numbers as tuned
+from edge_server.surface import surface_constants as tuned
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels import patch_match
 from edge_server.surface.kernels.patch_images import Planes
 from edge_server.surface.reconstruct import covering_maps, make_depth_maps
 from edge_server.surface.refine_depth import _images, _view, exposures, refine_depth
 from edge_server.surface.settings import MeshSettings
-from edge_server.surface.tuned_numbers import REACH, UNSURE
+from edge_server.surface.surface_constants import REACH, UNSURE
 from freshfield.geometry import Pinhole, look_at, world_rays
 
 LENS = Pinhole.from_fov(72, 72, 45.0)

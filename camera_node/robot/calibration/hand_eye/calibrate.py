@@ -11,7 +11,7 @@ import yaml
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
 from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
-from camera_node.robot.calibration import tuned_numbers as tuned
+from camera_node.robot.calibration import calibration_constants as tuned
 from camera_node.robot.calibration.hand_eye.closed_form import METHODS, Residuals, solve
 from camera_node.robot.calibration.hand_eye.refinement import Refinement, refine
 from camera_node.robot.calibration.hand_eye.samples import (

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.calibration_constants import MAX_CLOSED_FORM
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, angle_deg, distance_mm, medoid
-from camera_node.robot.calibration.tuned_numbers import MAX_CLOSED_FORM
 from freshfield.geometry import se3
 
 METHODS = {

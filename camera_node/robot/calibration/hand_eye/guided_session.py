@@ -18,7 +18,7 @@ import numpy as np
 
 from camera_node.robot.arm.camera_poses import base_matrix
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration import tuned_numbers as tuned
+from camera_node.robot.calibration import calibration_constants as tuned
 from camera_node.robot.calibration.hand_eye.refinement import refine
 from camera_node.robot.calibration.hand_eye.samples import (
     Array,

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND
-from camera_node.robot.calibration import tuned_numbers as tuned
+from camera_node.robot.calibration import calibration_constants as tuned
 from camera_node.robot.calibration.hand_eye.closed_form import start as closed_form_start
 from camera_node.robot.calibration.hand_eye.samples import Array, Rotation, Samples, rotation_vectors
 from freshfield.geometry import se3, se3_inverse

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, SETUPS
 from camera_node.robot.calibration import CalibrationError
-from camera_node.robot.calibration import tuned_numbers as tuned
+from camera_node.robot.calibration import calibration_constants as tuned
 from freshfield.geometry import Array, se3_inverse
 
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
-from camera_node.robot.calibration import tuned_numbers as tuned
+from camera_node.robot.calibration import calibration_constants as tuned
 from camera_node.robot.calibration.targets import Array, Corners
 from freshfield.geometry import Pinhole, se3, so3_log
 

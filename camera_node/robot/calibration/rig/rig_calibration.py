@@ -11,10 +11,16 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.calibration_constants import (
+    FEW_SHARED,
+    LARGEST_PX,
+    MIN_SHARED,
+    OUTLIER_ERROR,
+    OUTLIER_PX,
+)
 from camera_node.robot.calibration.hand_eye.samples import medoid
 from camera_node.robot.calibration.rig.bundle_adjustment import Bundle, Sighting, adjust
 from camera_node.robot.calibration.targets import Array, Corners, estimate_pose
-from camera_node.robot.calibration.tuned_numbers import FEW_SHARED, LARGEST_PX, MIN_SHARED, OUTLIER_ERROR, OUTLIER_PX
 from camera_node.sources.rig_calibration import calibration_entry
 from freshfield.geometry import Pinhole, se3_inverse
 

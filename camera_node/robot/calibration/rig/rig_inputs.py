@@ -14,9 +14,15 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration.calibration_constants import (
+    LIVE_WAIT_S,
+    MOMENT_S,
+    NEW_SHARE,
+    STILL_PX,
+    UNKNOWN_FOV_DEG,
+)
 from camera_node.robot.calibration.inputs import find_corners, list_images, show_progress
 from camera_node.robot.calibration.targets import Corners, GrayImage, Target, to_gray
-from camera_node.robot.calibration.tuned_numbers import LIVE_WAIT_S, MOMENT_S, NEW_SHARE, STILL_PX, UNKNOWN_FOV_DEG
 from camera_node.sources.datasets.video import Clip
 
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv", ".webm")

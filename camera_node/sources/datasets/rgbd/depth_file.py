@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.datasets.image_reading import decode_file, read_numbers, shrink
 from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import Photo

@@ -28,7 +28,11 @@ from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, Image, PosedImage, errors_at
 from camera_node.sources.datasets.rgbd.depth_file import registered, to_counts
-from camera_node.sources.tuned_numbers import RECORDING_DEPTH_NEAR_NS, RECORDING_PARENTS_NEAR_NS, RECORDING_POSE_NEAR_NS
+from camera_node.sources.source_constants import (
+    RECORDING_DEPTH_NEAR_NS,
+    RECORDING_PARENTS_NEAR_NS,
+    RECORDING_POSE_NEAR_NS,
+)
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose, quaternion_normalize
 

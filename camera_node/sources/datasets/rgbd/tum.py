@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from camera_node.pose.providers import PoseGapError, read_tum
-from camera_node.sources import tuned_numbers as tuned
+from camera_node.sources import source_constants as tuned
 from camera_node.sources.datasets.lens import Lens
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageFiles, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.cameras import tuned_numbers as tuned
-from edge_server.fields.common.tuned_numbers import BETA1, BETA2
+from edge_server.fields.common.cameras import camera_refinement_constants as tuned
+from edge_server.fields.common.field_constants import BETA1, BETA2
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.cameras import tuned_numbers as tuned
+from edge_server.fields.common.cameras import camera_refinement_constants as tuned
 from edge_server.fields.common.cameras.appearance import AppearanceEmbeddings
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.common.kernels.rays import Views

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.cameras import tuned_numbers as tuned
+from edge_server.fields.common.cameras import camera_refinement_constants as tuned
 from freshfield.geometry import so3_log
 
 Array = NDArray[np.float64]

@@ -25,12 +25,12 @@ FAST = {"contract", "reassoc", "arcp", "nsz"}
 def cache_folder(root: Path) -> Path:
     """Where compiled kernels are kept: a folder in $NUMBA_CACHE_DIR, or in the user's cache, for each state of
     the sources. numba checks only the file that a function stands in, but kernels inline functions of others, and
-    numbers of ``settings`` and ``tuned_numbers``.
+    numbers of ``settings`` and ``*_constants``.
 
     root: the package whose folders called ``kernels`` count.
     """
     total = hashlib.sha256()
-    names = ("settings.py", "tuned_numbers.py")
+    names = ("settings.py", "*_constants.py")
     numbers = [path for room in ("fields", "surface") for name in names for path in root.glob(f"{room}/**/{name}")]
     for path in sorted([*root.rglob("kernels/*.py"), *numbers]):
         total.update(path.relative_to(root).as_posix().encode() + path.read_bytes())

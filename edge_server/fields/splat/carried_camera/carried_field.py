@@ -19,7 +19,7 @@ from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
-from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
+from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.discs import usable_depth
 from edge_server.fields.splat.carried_camera.own_motion import OwnMotion, search
 from edge_server.fields.splat.carried_camera.plausibility import agreeing, flat, moved_in, troubles, unturned

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrection, PoseCorrections
 from edge_server.fields.common.field_state import from_json, to_json
-from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
+from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.tracking import Gray, Rendered, align, align_from, gray
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 

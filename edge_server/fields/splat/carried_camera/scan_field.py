@@ -22,7 +22,7 @@ from edge_server.fields.common.cameras.pose_corrections import PoseCorrections, 
 from edge_server.fields.common.plane_sweep import foreground_mask
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.view_store import Arrays, same_views
-from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
+from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.discs import discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.carried_camera.exposures import Exposures
 from edge_server.fields.splat.carried_camera.refined_cameras import RefinedCameras, ScanSnapshot
@@ -32,7 +32,7 @@ from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE, SH_COLUMNS
 from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_tiles
-from edge_server.fields.splat.tuned_numbers import PRUNE_OPACITY
+from edge_server.fields.splat.splat_constants import PRUNE_OPACITY
 from freshfield.geometry import Pinhole
 
 T = TypeVar("T")

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
+from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from freshfield.geometry import Pinhole, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]

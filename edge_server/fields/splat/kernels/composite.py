@@ -38,7 +38,7 @@ from edge_server.fields.splat.kernels.project import (
     RED,
     TILE,
 )
-from edge_server.fields.splat.tuned_numbers import ALPHA_MAX, ALPHA_MIN, STOP
+from edge_server.fields.splat.splat_constants import ALPHA_MAX, ALPHA_MIN, STOP
 
 SUMS = 9  # sums that the backward pass gathers a pair: see ``project_backward``
 

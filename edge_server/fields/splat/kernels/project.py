@@ -16,7 +16,13 @@ from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, SIZE, l
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw, exp32, is_finite, log32
 from edge_server.fields.common.kernels.volume_rendering import harmonic
-from edge_server.fields.splat.tuned_numbers import ALPHA_MIN, LOG_SCALE_HIGH, LOG_SCALE_LOW, LOW_PASS, RAW_OPACITY_LIMIT
+from edge_server.fields.splat.splat_constants import (
+    ALPHA_MIN,
+    LOG_SCALE_HIGH,
+    LOG_SCALE_LOW,
+    LOW_PASS,
+    RAW_OPACITY_LIMIT,
+)
 
 # Columns of a Gaussian's parameters; from BASE on the SH_COLUMNS of the spherical harmonics of degree 1,
 # three for each.

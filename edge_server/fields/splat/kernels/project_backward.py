@@ -27,7 +27,7 @@ from edge_server.fields.splat.kernels.project import (
     rotation,
     unit_quaternion,
 )
-from edge_server.fields.splat.tuned_numbers import LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
+from edge_server.fields.splat.splat_constants import LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
 
 # Rows of BLOCK numbers: position, raw scale, quaternion, raw opacity; then for one camera: opacity,
 # conic, sums over pairs, whether there are any pairs, and the length of the gradient by the projected mean;

@@ -12,7 +12,7 @@ import numpy as np
 from edge_server.fields.common.kernels.camera import LENS, ORIGIN, SIZE, distort, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat import tuned_numbers as tuned
+from edge_server.fields.splat import splat_constants as tuned
 
 COST = 240  # 9 of them fit into the 16 bits of a sum over 3 x 3 pixels, and so do those of four paths
 UNKNOWN = 1e9  # color of a pixel of which nothing is known

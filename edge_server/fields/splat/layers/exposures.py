@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from edge_server.fields import Rendering
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.observations import FixedCamera
 
 

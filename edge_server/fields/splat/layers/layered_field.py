@@ -29,7 +29,7 @@ from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, comp
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import (
@@ -467,7 +467,9 @@ class LayeredField:
 
 def _is_measured_with(view: View) -> bool:
     """Whether a view's depth shows what moves where its image does."""
-    from edge_server.fields.splat.layers.depth.tuned_numbers import BODY_GAP_NS  # only where a camera measures depth
+    from edge_server.fields.splat.layers.depth.layer_depth_constants import (
+        BODY_GAP_NS,  # only where a camera measures depth
+    )
 
     return view.depth_ns is None or abs(view.depth_ns - view.generated_ns) <= BODY_GAP_NS
 

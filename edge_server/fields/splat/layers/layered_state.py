@@ -16,12 +16,12 @@ from edge_server.fields.common.field_state import unpack_meta
 from edge_server.fields.common.supervision import check_view
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.fields.splat.layers.layer_constants import FRAMES_KNOWN
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import FinePlate, Plate
 from edge_server.fields.splat.layers.static_layer import StaticLayer
 from edge_server.fields.splat.layers.static_supervision import StaticSupervision
-from edge_server.fields.splat.layers.tuned_numbers import FRAMES_KNOWN
 from freshfield.geometry import Pinhole
 
 Arrays = dict[str, NDArray[Any]]

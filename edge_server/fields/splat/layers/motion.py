@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
 
 WINDOW = tuned.FREE + tuned.FIXED

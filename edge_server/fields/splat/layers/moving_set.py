@@ -18,7 +18,7 @@ from edge_server.fields.splat.densification import GaussianCloud, densify_and_pr
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.kernels.rasterize import Targets
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.align import align_view
 from edge_server.fields.splat.layers.motion import Motion, ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.field_state import give_attributes, load_arrays, take_attributes
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.plates import (
     MODES,
     PlateArrays,

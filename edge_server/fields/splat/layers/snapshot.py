@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.splat.kernels.project import Gaussians
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.snapshot import SplatSnapshot

@@ -17,13 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Rendering, View
+from edge_server.fields.common.field_constants import LOSS_STEPS
 from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.threads.thread_pool import lower_priority
 from edge_server.fields.common.training_schedule import StepBudget
-from edge_server.fields.common.tuned_numbers import LOSS_STEPS
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
 Arrays = dict[str, NDArray]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
 from edge_server.fields.common.training_schedule import StepBudget
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.exposures import equalize_exposures
 from edge_server.fields.splat.layers.observations import FixedCamera, Observations
 from edge_server.fields.splat.layers.plates import plain_share
@@ -136,7 +136,7 @@ class StaticSupervision:
         if not observed or any(camera.plate.count < tuned.PLATE_FRAMES for camera in observed):
             return False
         if self._depth_is_known(observed):
-            from edge_server.fields.splat.layers.depth.tuned_numbers import PLATE_S
+            from edge_server.fields.splat.layers.depth.layer_depth_constants import PLATE_S
 
             return observations.newest_s >= PLATE_S
         if observations.newest_s < tuned.EARLY_S:
@@ -300,7 +300,7 @@ class StaticSupervision:
         most as many as that has had, which on a busy machine are few."""
         if not self.with_depth:
             return tuned.EARLY_SHOWN_AFTER
-        from edge_server.fields.splat.layers.depth.tuned_numbers import SHOWN_AFTER
+        from edge_server.fields.splat.layers.depth.layer_depth_constants import SHOWN_AFTER
 
         least, most = SHOWN_AFTER
         if self.early or self.earlier is None:

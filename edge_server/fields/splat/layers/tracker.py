@@ -13,7 +13,7 @@ import numpy as np
 
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations, knot_of, pixel_weights
 

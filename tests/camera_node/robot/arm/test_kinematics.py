@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from camera_node.pose.pairing import SampleBuffer
 from camera_node.robot.arm import ArmError
+from camera_node.robot.arm.arm_constants import FARTHEST_RAD
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
 from camera_node.robot.arm.capsules import PAIRS, CapsuleModel, segment_distance
 from camera_node.robot.arm.hand_eye_mount import read_hand_eye
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
-from camera_node.robot.arm.tuned_numbers import FARTHEST_RAD
 from camera_node.robot.arm.viewpoint_tour import is_free, plan_tour, reachable, viewpoints
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.settings import PathConfig, source_config

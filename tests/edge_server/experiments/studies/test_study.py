@@ -22,8 +22,8 @@ from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
 from edge_server.experiments.studies.registry import LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import Study, StudyError, StudyRequest
 from edge_server.experiments.studies.study_command import checked, main
+from edge_server.experiments.studies.study_constants import TRAININGS
 from edge_server.experiments.studies.trial import Trial, run_trial
-from edge_server.experiments.studies.tuned_numbers import TRAININGS
 from edge_server.experiments.studies.verdicts import Claim, Finding, Verdict, judge
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.rewards import f_w

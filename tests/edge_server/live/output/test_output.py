@@ -132,7 +132,7 @@ def mcap(tmp_path):
 def test_what_finds_no_room_in_a_recording_is_dropped_and_counted_and_nobody_waits(mcap, monkeypatch):
     from freshfield.session.reader import Session
 
-    monkeypatch.setattr("edge_server.live.tuned_numbers.MOST_QUEUED", 10)
+    monkeypatch.setattr("edge_server.live.live_constants.MOST_QUEUED", 10)
     recorder = Recorder(mcap, "test")
     stuck, go_on = threading.Event(), threading.Event()
     write = recorder._writer.frame

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.kernels.project import Gaussians
+from edge_server.fields.splat.layers.layer_constants import KNOTS_PER_S
 from edge_server.fields.splat.layers.motion import WINDOW, Motion
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
-from edge_server.fields.splat.layers.tuned_numbers import KNOTS_PER_S
 from freshfield.geometry import Pinhole, look_at
 
 BOX = SceneBox((0.5, -0.2, 1.0), 2.0, 0.2, True, 3.0, 0.01)

@@ -12,7 +12,7 @@ from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.report.explain_command import main
 from edge_server.scheduler import Epoch, make_policy, parse_policy
-from edge_server.scheduler.learned import tuned_numbers as tuned
+from edge_server.scheduler.learned import learning_constants as tuned
 from edge_server.scheduler.learned.actor import Decision
 from edge_server.scheduler.learned.bandit import BanditPolicy
 from edge_server.scheduler.learned.decision_record import FOLDER, DecisionWriter, read_decision

@@ -14,7 +14,7 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import COLOR, OPACITY, QUATERNION, SCALE
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.kernels.body_depth import count_seen_through, measure_body
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.kernels.depth_plate import (
     fill_holes,
     find_medians,
@@ -122,7 +122,7 @@ def smooth(
     """Smooth inverse depths along surfaces, and fill holes of a few pixels.
 
     inverse: float32 (H, W), 1 / m, 0 unknown. image: float32 (H, W, 3), steps of 255.
-    noise: see ``tuned_numbers.NOISE``.
+    noise: NOISE of the constants of depth.
     Returns inverse depth, float32 (H, W), and its slope a pixel to the right and down, float32 (H, W, 2).
     """
     image = np.ascontiguousarray(image, np.float32)

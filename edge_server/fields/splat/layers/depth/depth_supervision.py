@@ -14,8 +14,8 @@ from edge_server.fields import View
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels
-from edge_server.fields.splat.layers import tuned_numbers as of_layers
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as of_layers
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.body_depth import body_depth, seen_through
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians

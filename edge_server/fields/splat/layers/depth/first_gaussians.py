@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, SH_COLUMNS
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from edge_server.fields.splat.settings import SplatSettings
 

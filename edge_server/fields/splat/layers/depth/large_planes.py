@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 
 Array = NDArray[np.float64]

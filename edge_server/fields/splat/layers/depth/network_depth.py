@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.overlaps import overlaps
 from edge_server.fields.splat.layers.depth.surfaces import Surface

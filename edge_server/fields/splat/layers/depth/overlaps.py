@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.scene_box import converging_point
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.surfaces import Surface
-from edge_server.fields.splat.layers.tuned_numbers import BRIGHT, DARK
+from edge_server.fields.splat.layers.layer_constants import BRIGHT, DARK
 
 
 class Overlap(NamedTuple):

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields.common.field_constants import SAME_POSE
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.common.tuned_numbers import SAME_POSE
 from edge_server.fields.splat.kernels.semi_global import UNKNOWN
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.surfaces import Surface
-from edge_server.fields.splat.layers.tuned_numbers import CHANGED
+from edge_server.fields.splat.layers.layer_constants import CHANGED
 from edge_server.fields.splat.stereo import match_depths
 from freshfield.geometry import Pinhole
 

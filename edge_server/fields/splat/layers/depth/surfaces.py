@@ -12,7 +12,7 @@ from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.camera import LENS, ORIGIN
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.kernels.surfaces import Meshes, draw_meshes, shade_surfaces
 from freshfield.geometry import Pinhole
 

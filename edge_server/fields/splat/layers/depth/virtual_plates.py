@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.scene_box import converging_point
 from edge_server.fields.common.threads.thread_pool import Pool
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.surfaces import Surface, SurfaceScene
 from edge_server.fields.splat.layers.static_layer import PlateImage
 from freshfield.geometry import look_at

@@ -32,8 +32,8 @@ from edge_server.fields.common.kernels.simd_vectors import (
 from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIP, STRIPS, _StripBuilder
 from edge_server.fields.splat.kernels.project import CONIC_A, CONIC_B, CONIC_C, MEAN_X, MEAN_Y, RED, TILE
 from edge_server.fields.splat.kernels.rasterize import begin_tile, composite_strips, strip_scratch
-from edge_server.fields.splat.layers.tuned_numbers import ATTACHED, NOISE, ROBUST
-from edge_server.fields.splat.tuned_numbers import ALPHA_MAX, ALPHA_MIN
+from edge_server.fields.splat.layers.layer_constants import ATTACHED, NOISE, ROBUST
+from edge_server.fields.splat.splat_constants import ALPHA_MAX, ALPHA_MIN
 
 _COLUMN = 3 * PIXELS  # floats: red, green and blue of a tile
 _ANCHOR = 2 * _COLUMN

@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.simd import count_bits, lowest_bit
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 
 # Zeros around the image: dilation grows into them, so that erosion ends where the image does.
 _EDGE = 8

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.masks import clean_mask
 
 MODES = 3  # colors a pixel remembers

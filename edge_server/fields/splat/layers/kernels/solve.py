@@ -12,7 +12,7 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw
-from edge_server.fields.splat.layers.tuned_numbers import MOST_ITERATIONS, TOLERANCE
+from edge_server.fields.splat.layers.layer_constants import MOST_ITERATIONS, TOLERANCE
 
 BAND = 4  # knots that one view bears on
 PAIRS = 10  # pairs i <= j of these knots

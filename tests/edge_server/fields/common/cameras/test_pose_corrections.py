@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import View
-from edge_server.fields.common.cameras import tuned_numbers as tuned
+from edge_server.fields.common.cameras import camera_refinement_constants as tuned
 from edge_server.fields.common.cameras.appearance import AppearanceEmbeddings
 from edge_server.fields.common.cameras.constant_correction import constant_correction
 from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrections, normal_matrix

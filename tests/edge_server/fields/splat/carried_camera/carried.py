@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from edge_server.experiments.scenes.multiview_still import score_views
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, View
-from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
+from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import Pinhole, look_at, so3_exp, world_rays

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
+from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from freshfield.geometry import look_at, se3, so3_exp
 from tests.edge_server.fields.scenes import a_meter_off, seen

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.threads.thread_pool import shared_pool
-from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
+from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.discs import discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.carried_camera.sweep import neighbors, sweep_depth
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE

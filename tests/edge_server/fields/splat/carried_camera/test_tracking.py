@@ -8,7 +8,7 @@ import pytest
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
-from edge_server.fields.splat.carried_camera import tuned_numbers as tuned
+from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.exposures import Exposures
 from edge_server.fields.splat.carried_camera.plausibility import moved_in, troubles, unturned
 from edge_server.fields.splat.carried_camera.tracking import Rendered, align

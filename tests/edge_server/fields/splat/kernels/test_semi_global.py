@@ -8,7 +8,7 @@ from scipy.ndimage import uniform_filter
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
-from edge_server.fields.splat import tuned_numbers as tuned
+from edge_server.fields.splat import splat_constants as tuned
 from edge_server.fields.splat.kernels.semi_global import COST, UNKNOWN, aggregate_paths, choose_depths, match_costs
 from freshfield.geometry import Pinhole, look_at, se3_inverse
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from edge_server.fields.splat.layers import tuned_numbers as tuned
-from edge_server.fields.splat.layers.depth import tuned_numbers as depth_numbers
+from edge_server.fields.splat.layers import layer_constants as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as depth_numbers
 
 
 @pytest.fixture(autouse=True)

@@ -19,7 +19,7 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, View
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.bump import degrees_of, find_turn
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from freshfield.geometry import Pinhole, look_at, so3_exp, world_rays

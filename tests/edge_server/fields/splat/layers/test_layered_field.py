@@ -18,7 +18,7 @@ from msgspec import structs
 from edge_server.fields import Budget, View
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.field import StillField
-from edge_server.fields.splat.layers import tuned_numbers as tuned
+from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from edge_server.fields.splat.layers.layered_state import VERSION
 from edge_server.fields.splat.layers.plates import Plate

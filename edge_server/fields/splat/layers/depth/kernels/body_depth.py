@@ -11,7 +11,7 @@ import numpy as np
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, lens_terms, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import draw
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.kernels.depth_plate import insert_sorted, pixel_median
 
 _WINDOW = (2 * tuned.BODY_RADIUS_PX + 1) ** 2

@@ -9,7 +9,7 @@ import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 
 _ROWS = 8  # rows of pixels a task
 _F0, _F1 = np.float32(0.0), np.float32(1.0)
@@ -108,7 +108,8 @@ def fit_planes(counter, worker, inverse, image, nearness, noise, plane, slope):
     least squares, reweighted by the distance to the plane (Cauchy). Tasks are runs of rows.
 
     inverse: float32 (H, W). image: float32 (H, W, 3), steps of 255: neighbors of another color count less.
-    nearness: float32 (2 RADIUS + 1, 2 RADIUS + 1), weights of the window. noise: 1 / m, see ``tuned_numbers.NOISE``.
+    nearness: float32 (2 RADIUS + 1, 2 RADIUS + 1), weights of the window. noise: 1 / m, NOISE of the
+        constants of depth.
     plane: float32 (H, W), written: inverse depth. slope: float32 (H, W, 2), written: its change a pixel to the right
         and down.
     """

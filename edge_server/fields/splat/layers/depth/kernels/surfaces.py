@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.camera import LENS, ORIGIN, distort, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 
 _ROWS = 8  # rows of pixels a task
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)

@@ -6,7 +6,7 @@ import pytest
 from numpy.typing import NDArray
 
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate, smooth
 from edge_server.fields.splat.layers.depth.kernels.body_depth import measure_body
 

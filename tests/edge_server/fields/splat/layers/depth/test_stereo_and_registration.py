@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.threads.thread_pool import shared_pool
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
 from edge_server.fields.splat.layers.depth.depth_supervision import CameraPlates, DepthSupervision
 from edge_server.fields.splat.layers.depth.plate_stereo import PlateStereo

@@ -11,7 +11,7 @@ from edge_server.fields import View
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.kernels.project import COLOR, QUATERNION, SCALE
-from edge_server.fields.splat.layers.depth import tuned_numbers as tuned
+from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.first_gaussians import first_gaussians
 from edge_server.fields.splat.layers.depth.large_planes import Plane, continued, large_planes

@@ -10,8 +10,8 @@ from msgspec import structs
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget
-from edge_server.fields.splat.layers import tuned_numbers as layer_numbers
-from edge_server.fields.splat.layers.depth import tuned_numbers as depth_numbers
+from edge_server.fields.splat.layers import layer_constants as layer_numbers
+from edge_server.fields.splat.layers.depth import layer_depth_constants as depth_numbers
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from tests.edge_server.fields.scenes import seen
 from tests.edge_server.fields.small import same_state

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from camera_node.robot.arm import ArmError
-from camera_node.robot.arm import tuned_numbers as tuned
+from camera_node.robot.arm import arm_constants as tuned
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_flange, require_arm
 from camera_node.robot.arm.control import (
     confirm_motion,

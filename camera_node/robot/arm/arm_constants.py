@@ -13,7 +13,7 @@ NEXT_STATE_S, NEXT_STATE_POLL_S = 0.03, 0.001
 JOIN_S = 2.0  # for the reading thread to end
 DRIVE_HZ = 50.0  # joint states a second of an arm that is driven through a tour
 
-# --- moving (control, drive_tour, camera_node.robot.teleop.sinks) ---
+# --- moving (control, drive_arm_command, camera_node.robot.teleop.sinks) ---
 # CONTROL_S: the control interface has to connect within it. STOPPING_S: a stop is waited for so long.
 CONTROL_S, STOPPING_S = 8, 5.0
 STOP_RAD_S2 = 2.0  # deceleration of every stop
@@ -25,7 +25,7 @@ STALLED_S, STALLED_RAD = 5.0, 1e-3
 # Largest turn of a joint by hand that is tolerated between what was shown to the operator and the answer.
 MOVED_RAD = 0.01
 
-# --- tours of viewpoints (viewpoint_tour, drive_tour, kinematics) ---
+# --- tours of viewpoints (viewpoint_tour, drive_arm_command, kinematics) ---
 FARTHEST_RAD = 2.0  # largest turn of a joint in one move
 CHECKED_POSTURES = 24  # along a path, ends included, that have to be free
 LEAST_VIEWPOINTS = 3  # that a tour has to reach

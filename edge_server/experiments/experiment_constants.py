@@ -55,8 +55,8 @@ NAMED_VIEWS = 6  # views that an error names
 LEAST_SCORED_WEIGHT = 0.5
 
 # --- training of schedulers (rollouts.episode, rollouts.setting, training, studies.learning) ---
-# Instants lie on a grid that contains ``fidelity.tuned_numbers.MOVING_LAGS_MS``, so that evaluations share renderings
-# of the truth: one costs ten times a score.
+# Instants lie on a grid that contains MOVING_LAGS_MS of ``fidelity_constants``, so that evaluations share renderings of
+# the truth: one costs ten times a score.
 INSTANT_GRID_MS = 10
 TRUTHS_KEPT = 8192  # renderings of held-out cameras kept in memory
 TRAINING_STEPS, SCRATCH_STEPS = 20, 50  # optimizer steps of an update; of one that starts with an empty field

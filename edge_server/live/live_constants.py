@@ -35,8 +35,7 @@ TOO_SHORT, TOO_SHORT_OF = 10, 30  # a warning is due if so many of the latest so
 WARN_EVERY_S = 30.0  # between two warnings of one kind
 # Most that the server waits at its end for the update in progress, without which there is no checkpoint. On a machine
 # with five times as much to do as it has cores, updates of ``ngp`` at 640 x 480 take 6 s, the longest 18. The launcher
-# kills the server after ``freshfield_up.tuned_numbers.GRACE_S``, of which the checkpoint and the last pictures need
-# some.
+# kills the server after GRACE_S of ``launcher_constants``, of which the checkpoint and the last pictures need some.
 STOP_S = 20.0
 
 # --- scores: which held-out frame shows the instant of an update (scoring.held_out) ---
