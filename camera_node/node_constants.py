@@ -28,7 +28,7 @@ KEPT_OFFSETS = 16  # latest exchanges, of which the one with the smallest error 
 OFFSET_DRIFT_PPM = 50.0  # by which an exchange's error bound grows with its age
 ARRIVAL_WINDOW_NS = 5_000_000_000  # in which the fastest sample of a device tells the offset of its clock
 
-# --- poses from a tracker or an arm (pose.pairing, pose.tracker) ---
+# --- poses from a tracker, an arm or a file (pose.pairing, pose.tracker, pose.providers) ---
 # Samples older than the newest by more than KEPT_POSES_NS are dropped; RESTART_POSES of them in a row replace the
 # others: the sender's clock was set back.
 KEPT_POSES_NS, RESTART_POSES = 2_000_000_000, 8
@@ -39,6 +39,9 @@ TRACKER_LATE_S = 0.1
 # Bytes read at once, compared again later, and longest line that is kept: one has some 100.
 TRACKER_LINE_BYTES = 4096
 TRACKER_JOIN_S = 2.0  # for its thread to end
+# Absolute value of a time stamp in a file: the difference of two fits in 64 bits of nanoseconds. Counted from 1970 it
+# is the year 2115; larger ones have another unit.
+MAX_STAMP_S = 4.6e9
 
 # --- the folder of rendered frames (synthetic.frame_cache) ---
 # Here, since what the files of ``synthetic`` say is part of the key of rendered frames.

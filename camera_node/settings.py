@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from msgspec import Meta, field
 
+from camera_node.node_constants import MAX_STAMP_S
 from camera_node.sources.source_constants import FIRST_FRAME_S
 from freshfield import plugins
-from freshfield.limits import MAX_IMAGE_SIDE_PX, MAX_STAMP_S
+from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.payload import DEFAULT_CODEC
 from freshfield.scenario import Scenario
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within

@@ -28,3 +28,17 @@ DEPTH_MOST_ASPECT = 2.5
 # --- the foreground's detector (foreground.detector) ---
 NMS_IOU = 0.6  # non-maximum suppression: two boxes of a class with a larger intersection over union are one object
 NMS_BOXES = 300  # most boxes that enter it, those with the highest scores
+
+# --- what files and scenarios may ask for at most (embed, foreground, fields.checkpoint, scheduler, settings) ---
+# Memory for all ONNX models of a process together: four times the need of the largest YOLO11 for a batch. A larger
+# allocation fails, whatever sizes the file states.
+MAX_MODEL_BYTES = 4 * 2**30
+MAX_MODEL_FILE_BYTES = 512 * 2**20  # of an ONNX model's file: twice the largest detectors of the family, 230 MB
+# Nodes of an ONNX model: three times the largest of the family, quantized. ONNX Runtime takes 1 s to load a chain of so
+# many, 12 s of 30,000.
+MAX_GRAPH_NODES = 10_000
+# Largest tensor of an ONNX model per image: six times the largest of YOLO11x at 640 pixels.
+MAX_TENSOR_ELEMENTS = 2**26
+MAX_MODEL_SIDE_PX = 2048  # width and height of the images that an ONNX model takes
+MAX_POLICY_CHARS = 1024  # of a policy's name, which may contain a file's path
+LONGEST_MS = 3_600_000.0  # wait, period, deadline or update: in an hour every scene has changed

@@ -16,10 +16,10 @@ import msgspec
 from msgspec.structs import replace
 
 from edge_server import edge_constants as tuned
+from edge_server.edge_constants import LONGEST_MS
 from edge_server.fields.registry import FIELD
 from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.scheduler import Policy, resolve_checkpoint
-from freshfield.limits import LONGEST_MS
 from freshfield.scenario import Scenario
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 from freshfield.untrusted import read_json, read_text

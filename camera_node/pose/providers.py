@@ -14,11 +14,11 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from camera_node.node_constants import MAX_STAMP_S
 from camera_node.pose.pairing import PoseGapError as PoseGapError
 from camera_node.pose.pairing import SampleBuffer
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.geometry import GeometryError, Pose, quaternion_normalize
-from freshfield.limits import MAX_STAMP_S
 from freshfield.untrusted import read_text
 
 _COLUMN_NAMES = ("t", "time", "timestamp")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import grpc
 import grpc.aio
 
-from freshfield.limits import MAX_CHANNEL_CHANGES, MAX_SET_DELAY_MS
+from channel_emu.live.live_emulator_constants import MAX_CHANNEL_CHANGES, MAX_SET_DELAY_MS
 from freshfield.v1 import channel_pb2, channel_pb2_grpc
 
 if TYPE_CHECKING:

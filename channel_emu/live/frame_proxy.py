@@ -32,7 +32,7 @@ from channel_emu.model.settings import ChannelConfig
 from freshfield.files import write_json
 from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
 from freshfield.ledger import Ledger
-from freshfield.limits import MAX_OTHER_CALLS, MAX_STREAMS_PER_CAMERA
+from freshfield.limits import MAX_STREAMS_PER_CAMERA
 from freshfield.streams import OpenStreams, ServedCall, SessionStreams, serve_health
 from freshfield.transport import CLIENT_OPTIONS
 from freshfield.v1 import channel_pb2, channel_pb2_grpc, clock_pb2, frames_pb2
@@ -62,7 +62,7 @@ class FrameProxy(Proxy):
         self, config: ChannelConfig, seed: int, options: ProxyOptions, cameras: Sequence[str], out: Path
     ) -> None:
         most_streams = MAX_STREAMS_PER_CAMERA * len(cameras)
-        super().__init__(config, seed, options, most_streams + MAX_OTHER_CALLS)
+        super().__init__(config, seed, options, most_streams + tuned.MAX_OTHER_CALLS)
         self.rejected: dict[str, int] = {}
         """Frames refused here, by reason."""
         self.streams = OpenStreams(most_streams)

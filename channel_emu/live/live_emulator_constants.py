@@ -8,7 +8,9 @@ MOST_METHODS = 64  # with links of their own; all others share one
 # Dropped ones are kept without their bytes.
 MOST_READY, MOST_BEHIND = 64, 10_000
 
-# --- frames to the edge (camera_stream, frame_proxy) ---
+# --- frames to the edge (camera_stream, frame_proxy, live_link) ---
+MAX_QUEUED_BYTES = 256 * 2**20  # of all frames inside the links: 2.5 s of a thousand cameras with 100 kB a second
+MAX_OTHER_CALLS = 100  # open calls besides the streams of frames: clock exchanges, health, reflection
 # Maximum number of a camera's unanswered frames. More than one, so that waiting for an answer does not delay the next
 # frame; few, so that a stalled edge is noticed at once.
 CREDITS = 8
@@ -18,6 +20,10 @@ FIRST_BACKOFF_S, MAX_BACKOFF_S = 0.1, 1.0  # pauses before a stream to the edge 
 FIRST_WAIT_S = 2.0  # nodes are admitted when the streams to the edge are open, or after this long without them
 WARN_AFTER_NS = 3 * 10**9  # the emulator warns once after so long without the edge
 EXCHANGE_TIMEOUT_S = 5.0  # longest duration of a clock exchange that is passed on
+
+# --- a running channel, changed by operators (channel_service) ---
+MAX_SET_DELAY_MS = 10_000.0  # mean delay that may be set: with more, a run would show nothing but its own start
+MAX_CHANNEL_CHANGES = 256  # that the status keeps, which is written twice a second; older ones are in the log
 
 # --- the end, the status and the past of the emulator (proxy, histogram) ---
 STOP_GRACE_S = 0.5  # for open calls to end when the emulator stops

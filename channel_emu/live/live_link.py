@@ -16,11 +16,11 @@ import grpc.aio
 
 from channel_emu.live.event_queue import EventQueue
 from channel_emu.live.histogram import Histogram
+from channel_emu.live.live_emulator_constants import MAX_QUEUED_BYTES
 from channel_emu.model.ages import RunningAge
 from channel_emu.model.channel import Channel
 from channel_emu.model.link import Event, EventKind, Link, Transit
 from channel_emu.model.trace import TraceWriter
-from freshfield.limits import MAX_QUEUED_BYTES
 
 STREAM_ENDED = (grpc.RpcError, grpc.aio.BaseError, asyncio.InvalidStateError)
 """Exceptions by which gRPC reports that a stream is over."""

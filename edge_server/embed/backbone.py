@@ -22,9 +22,9 @@ from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper
 from onnx.utils import Extractor
 
+from edge_server import edge_constants as tuned
 from edge_server.embed import EmbeddingError
 from edge_server.embed.projection import Projection, stored_projection
-from freshfield import limits
 from freshfield.untrusted import read_bytes
 
 OUTPUT = "pooled"
@@ -95,7 +95,7 @@ def load_backbone(path: Path) -> Backbone:
 
 def _read(path: Path) -> bytes:
     try:
-        return read_bytes(path, limits.MAX_MODEL_FILE_BYTES)
+        return read_bytes(path, tuned.MAX_MODEL_FILE_BYTES)
     except OSError as error:
         raise EmbeddingError(
             f"{path}: cannot be read: {error.strerror}; name a YOLO detection model in ONNX format"
@@ -111,9 +111,9 @@ def parse_model(data: bytes, path: Path) -> onnx.ModelProto:
         raise EmbeddingError(f"{path}: not an ONNX file, or cut short; export the model again") from None
     if not model.graph.node or not model.opset_import:
         raise EmbeddingError(f"{path}: not an ONNX model; export the model again")
-    if len(model.graph.node) > limits.MAX_GRAPH_NODES:
+    if len(model.graph.node) > tuned.MAX_GRAPH_NODES:
         raise EmbeddingError(
-            f"{path}: has {len(model.graph.node)} nodes, more than any network of images ({limits.MAX_GRAPH_NODES}); "
+            f"{path}: has {len(model.graph.node)} nodes, more than any network of images ({tuned.MAX_GRAPH_NODES}); "
             "export the model again"
         )
     loops = sorted({n.op_type for n in model.graph.node for a in n.attribute if a.HasField("g") or a.graphs})
@@ -214,9 +214,9 @@ def _shape_of(cut: onnx.ModelProto, meta: dict[str, str], path: Path) -> tuple[i
     batch, _, height, width = (d.dim_value for d in cut.graph.input[0].type.tensor_type.shape.dim)
     if not (height and width):
         height, width = exported_size(meta)
-    if not (1 <= height <= limits.MAX_MODEL_SIDE_PX and 1 <= width <= limits.MAX_MODEL_SIDE_PX):
+    if not (1 <= height <= tuned.MAX_MODEL_SIDE_PX and 1 <= width <= tuned.MAX_MODEL_SIDE_PX):
         raise EmbeddingError(
-            f"{path}: images of {width} x {height} are not within 1 to {limits.MAX_MODEL_SIDE_PX} a side"
+            f"{path}: images of {width} x {height} are not within 1 to {tuned.MAX_MODEL_SIDE_PX} a side"
         )
     return batch or None, (height, width)
 
@@ -245,7 +245,7 @@ def _check_shapes(cut: onnx.ModelProto, batch: int, height: int, width: int, pat
     shapes = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in known.graph.value_info}
     shapes |= {t.name: list(t.dims) for t in cut.graph.initializer}
     for name, shape in shapes.items():
-        if math.prod(max(d, 1) for d in shape) > limits.MAX_TENSOR_ELEMENTS * batch:
+        if math.prod(max(d, 1) for d in shape) > tuned.MAX_TENSOR_ELEMENTS * batch:
             raise EmbeddingError(f"{path}: the tensor {name} of shape {shape} is larger than any backbone's")
     pooled = shapes.get("pooled.float", [])
     if len(pooled) != 4 or pooled[1] < 1:

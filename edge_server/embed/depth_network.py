@@ -18,7 +18,6 @@ from edge_server import edge_constants as tuned
 from edge_server.embed import EmbeddingError
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
 from edge_server.embed.letterbox import checked
-from freshfield import limits
 
 MEAN, DEVIATION = np.array(
     [[0.485, 0.456, 0.406], [0.229, 0.224, 0.225]], np.float32
@@ -43,7 +42,7 @@ class DepthNetwork:
             raise EmbeddingError(f"{file}: expected a model of images (1, 3, height, width) of float32 or float16")
         self._input, self._type = inputs[0].name, INPUT_TYPES[inputs[0].type]
         self._fixed = [side if isinstance(side, int) else 0 for side in shape[2:]]
-        most = limits.MAX_MODEL_SIDE_PX
+        most = tuned.MAX_MODEL_SIDE_PX
         if max(self._fixed) > most:
             raise EmbeddingError(f"{file}: images of {self._fixed} pixels are larger than {most} a side")
         self(np.zeros((PATCH, PATCH, 3), np.uint8))  # a model that cannot run, or gives something else, fails here

@@ -17,8 +17,6 @@ from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import OUTPUT, Backbone, parse_model
 from edge_server.embed.letterbox import GRAY, blob, checked
 from edge_server.embed.projection import mean_and_axes
-from freshfield import limits
-from freshfield.limits import MAX_MODEL_BYTES
 from freshfield.untrusted import read_bytes
 
 # What ONNX Runtime calls the types of images that are fed to models.
@@ -90,7 +88,7 @@ class Embedder:
 def open_model(file: Path) -> ort.InferenceSession:
     """Open the ONNX model in ``file``, which may come from anywhere. Raises EmbeddingError."""
     try:
-        data = read_bytes(file, limits.MAX_MODEL_FILE_BYTES)
+        data = read_bytes(file, tuned.MAX_MODEL_FILE_BYTES)
     except OSError as error:
         raise EmbeddingError(f"{file}: cannot be read: {error.strerror}; name a model in ONNX format") from None
     parse_model(data, file)
@@ -123,15 +121,15 @@ def open_session(model: bytes, name: str) -> ort.InferenceSession:
 
 @functools.cache
 def _bound_memory() -> None:
-    """Give this process's sessions one CPU arena of MAX_MODEL_BYTES together: what exceeds it fails at once.
+    """Give this process's sessions one CPU arena of tuned.MAX_MODEL_BYTES together: what exceeds it fails at once.
     Sizes that depend on data (Expand, Tile, Range) cannot be checked before."""
     cpu = ort.OrtMemoryInfo("Cpu", ort.OrtAllocatorType.ORT_ARENA_ALLOCATOR, 0, ort.OrtMemType.DEFAULT)
-    ort.create_and_register_allocator(cpu, ort.OrtArenaCfg({"max_mem": MAX_MODEL_BYTES}))
+    ort.create_and_register_allocator(cpu, ort.OrtArenaCfg({"max_mem": tuned.MAX_MODEL_BYTES}))
 
 
 def reason_of(error: Exception, doing: str = "run") -> str:
     """One line on why ONNX Runtime cannot run or load a model. doing: that verb."""
     text = " ".join(str(error).split())
     if "bfc_arena" in text or "bad allocation" in text or "bad_alloc" in text:
-        text = f"ONNX models may take {MAX_MODEL_BYTES >> 20} MB of memory together, and it asks for more"
+        text = f"ONNX models may take {tuned.MAX_MODEL_BYTES >> 20} MB of memory together, and it asks for more"
     return f"ONNX Runtime cannot {doing} it: {text[:200]}"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from freshfield.limits import MAX_MODEL_BYTES
+from edge_server.edge_constants import MAX_MODEL_BYTES
 from freshfield.untrusted import check_file
 
 _FORMAT = "freshfield-{kind}-1"

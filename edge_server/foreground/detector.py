@@ -23,7 +23,6 @@ from edge_server.embed.backbone import exported_size
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
 from edge_server.embed.letterbox import blob, checked, placed
 from edge_server.foreground import MODELS, SHIPPED
-from freshfield import limits
 
 Array = NDArray[np.float64]
 
@@ -188,9 +187,9 @@ def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]
     height, width = (side if isinstance(side, int) else 0 for side in shape[2:])
     if not (height and width):
         height, width = exported_size(meta)
-    if not (1 <= height <= limits.MAX_MODEL_SIDE_PX and 1 <= width <= limits.MAX_MODEL_SIDE_PX):
+    if not (1 <= height <= tuned.MAX_MODEL_SIDE_PX and 1 <= width <= tuned.MAX_MODEL_SIDE_PX):
         raise EmbeddingError(
-            f"{file}: images of {width} x {height} are not within 1 to {limits.MAX_MODEL_SIDE_PX} a side"
+            f"{file}: images of {width} x {height} are not within 1 to {tuned.MAX_MODEL_SIDE_PX} a side"
         )
     return height, width
 

@@ -9,9 +9,9 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.live.live_constants import MAX_DEPTH_POINTS, MAX_DEPTH_RAYS_BYTES, MOST_DEPTH_MOVED
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
-from freshfield.limits import MAX_DEPTH_POINTS, MAX_DEPTH_RAYS_BYTES, MOST_DEPTH_MOVED
 
 _Lens = tuple[Pinhole, Pose | None, int]
 _kept: dict[_Lens, NDArray[np.float32]] = {}  # rays of lenses, the one that was used longest ago first

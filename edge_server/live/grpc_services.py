@@ -13,7 +13,6 @@ from edge_server.live import live_constants as tuned
 from edge_server.live.ingest import Ingest
 from edge_server.live.state import EdgeState, Publication
 from freshfield.clock import Clock
-from freshfield.limits import MAX_WATCHERS
 from freshfield.streams import OpenStreams, serve_health
 from freshfield.transport import Transport
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2
@@ -41,7 +40,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
 
     def __init__(self, state: EdgeState) -> None:
         self._state = state
-        self.watchers = OpenStreams(MAX_WATCHERS)
+        self.watchers = OpenStreams(tuned.MAX_WATCHERS)
 
     async def GetStatus(
         self, request: edge_pb2.GetStatusRequest, context: grpc.aio.ServicerContext

@@ -114,7 +114,7 @@ class FrameAdmission:
                 f"{k.width} x {k.height}: the scenario (source.width, source.height) has images of at most "
                 f"{self._max_side_px} pixels a side",
             )
-        most_px = max(self._max_side_px, limits.DEPTH_SIDE_PX)
+        most_px = max(self._max_side_px, tuned.DEPTH_SIDE_PX)
         if depth is not None and max(depth.width, depth.height) > most_px:
             raise FrameRejected("depth_too_large", f"depth of {depth.width} x {depth.height}: {most_px} a side at most")
         sessions = self._sessions[frame.camera]

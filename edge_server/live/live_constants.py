@@ -19,6 +19,20 @@ INTAKE_SHARE = 0.6
 LEAST_TAKEN = 4  # fewest new frames to take in, however short the budget is
 SILENT_SESSION_NS = 3 * 10**9  # a session that has sent nothing for this long is not that of a second node
 
+# --- measured depth that cameras send (depth_in_image, ingest) ---
+# Width and height of depth that is never too large, however small a scenario's images are: the sensors of RealSense and
+# OAK cameras have 1280 columns at most.
+DEPTH_SIDE_PX = 1280
+# Pixels of depth, for each of its image, that the edge moves there: all of 848 x 480 in an image of 320 x 240. Without
+# a bound, 1280 x 1280 in a small image cost .3 to .5 s, and may be a payload of 133 bytes.
+MAX_DEPTH_POINTS = 6
+# Pixels of depth that the edge moves into one image, however large that is: all of 848 x 480, each second row and
+# column of 1280 x 720. Without a bound, 1280 x 1280 cost .11 s a frame, and .55 s where its lens was new.
+MOST_DEPTH_MOVED = 1 << 19
+# Rays of depth sensors' lenses that the edge keeps, 12 bytes for each pixel that it moves into the image: those of 24
+# lenses of 640 x 480 or 8 of 1280 x 720. Bounded, because a hostile sender's lens may differ in each frame.
+MAX_DEPTH_RAYS_BYTES = 96 << 20
+
 # --- whether a camera moves (camera_motion) ---
 APART_M, APART_DEG = 0.03, 5.0  # two places of a camera are farther apart than one of these
 MOVES = 2  # a camera counts as moving once it has left so many places
@@ -88,6 +102,11 @@ SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` a
 KEPT_PUBLICATIONS = 4096  # latest publications that ``EdgeState`` keeps
 WATCH_S = 0.05  # between two looks of the operator service at new decisions; updates take hundreds of milliseconds
 USUAL_SPEED_M_PER_S = 1.0  # assumed of a scene whose speed is not given (``frontier``): a person walking
+
+# --- watchers of a run and of its metrics (grpc_services, output.guarded_http) ---
+MAX_WATCHERS = 32  # of decisions at once; each looks at the state twenty times a second
+MAX_SCRAPES = 8  # open connections to the metrics, or to the preference page; a new one ends the oldest
+SCRAPE_TIMEOUT_S = 5.0  # for which such a connection may send nothing
 
 # --- connections and keys (keys_command, output.guarded_http, server) ---
 CERTIFICATE_DAYS = 365  # for which a certificate of ``keys`` is valid

@@ -30,18 +30,19 @@ from websockets.exceptions import ConnectionClosedError, InvalidMessage
 from websockets.http11 import Request, Response
 
 from edge_server.page.branding import branded
-from edge_server.page.page_constants import CLOSE_S, SAY_EVERY_S
-from edge_server.page.splats.stream import STREAM, file_response
-from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
-from freshfield.limits import (
+from edge_server.page.page_constants import (
+    CLOSE_S,
     MAX_CLICKS_HZ,
     MAX_PAGE_CONNECTIONS,
     MAX_VIEW_SIDE_PX,
     MAX_VISITOR_MESSAGE_BYTES,
     MAX_VISITORS,
-    TLS_HANDSHAKE_TIMEOUT_S,
+    SAY_EVERY_S,
     VISITOR_TIMEOUT_S,
 )
+from edge_server.page.splats.stream import STREAM, file_response
+from freshfield.access import ANYBODY, CHANGE, Caller, HttpDoor, HttpRefused
+from freshfield.limits import TLS_HANDSHAKE_TIMEOUT_S
 
 log = logging.getLogger(__name__)
 

@@ -86,6 +86,17 @@ SCATTERED = 0.25
 # least.
 AHEAD_OF_SPREAD, LEAST_AHEAD_M = 3.0, 1.0
 
+# --- what visitors may do at most (access_guard, preferences) ---
+MAX_VISITORS = 32  # at once. One who does not read costs the data sent first, some megabytes
+VISITOR_TIMEOUT_S = 30.0  # for which sent data may stay unread: a slow line receives the first megabytes in that time
+MAX_VISITOR_MESSAGE_BYTES = 2**16  # of one message: viewpoints, clicks and values of controls take less than a kilobyte
+MAX_CLICKS_HZ = 50.0  # clicks on controls and cameras, and their burst: a number's arrow, held, makes 40
+MAX_VIEW_SIDE_PX = 16384  # width and height of a visitor's window: more than any screen has
+# Connections at once, of visitors and requests: a browser opens six. A new one ends the oldest request. With TLS the
+# same number may be in their handshake, of which a new one ends the oldest.
+MAX_PAGE_CONNECTIONS = 128
+MAX_ANSWER_BYTES = 2**10  # body of an answer to the preference page: a hundred bytes would do
+
 # --- ends of threads and connections (page_thread, access_guard) ---
 AFTER_ERROR_S = 1.0  # until a thread's next step, after one that failed
 THREAD_END_S = 5.0  # for a thread to end, when the page does

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from edge_server.edge_constants import LONGEST_MS
 from edge_server.scheduler.learned.state import STATE_PARTS, State
-from freshfield.limits import LONGEST_MS
 
 if TYPE_CHECKING:  # loaded only by the policies that need them
     from edge_server.scheduler.learned.actor import Decision

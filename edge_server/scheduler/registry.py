@@ -11,11 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
+from edge_server.edge_constants import MAX_POLICY_CHARS
 from edge_server.scheduler import fixed
 from edge_server.scheduler.policy import Policy
 from edge_server.scheduler.wait import Wait, WaitArrived, WaitFlush
 from freshfield import plugins
-from freshfield.limits import MAX_POLICY_CHARS
 from freshfield.scenario import SCENARIO_FOLDER
 
 # name -> (class, one line of help)

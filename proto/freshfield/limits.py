@@ -1,7 +1,8 @@
-"""Every bound on what a process accepts from outside, with its unit and the reason for its value.
+"""What frames, streams, connections and files may be at most, for every process, with unit and reason.
 
 A frame, a scenario or a stream that exceeds one of these is refused where it arrives, and the refusal is
-counted by its reason. Bounds of settings (in the sections of a scenario) are defined with the settings.
+counted by its reason. Bounds of settings (in the sections of a scenario) are defined with the settings; what one
+program alone accepts (visitors of its page, ONNX models, policies) is bounded in the constants of its folder.
 """
 
 from __future__ import annotations
@@ -18,24 +19,8 @@ MAX_MESSAGE_BYTES = MAX_PAYLOAD_BYTES + 4096
 MAX_IMAGE_SIDE_PX = 4096
 """Width and height of a decoded image: 50 MB of RGB, which bounds the cost of a decompression bomb."""
 
-DEPTH_SIDE_PX = 1280
-"""Width and height of depth that is never too large, however small a scenario's images are: the sensors of RealSense
-and OAK cameras have 1280 columns at most."""
-
 METERS_PER_COUNT = (1e-6, 1.0)
 """Scale of depth in 16 bits: at the least its range is 6.5 cm, less than any sensor's, at the most 65 km."""
-
-MAX_DEPTH_POINTS = 6
-"""Pixels of depth, for each of its image, that the edge moves there: all of 848 x 480 in an image of 320 x 240.
-Without a bound, 1280 x 1280 in a small image cost .3 to .5 s, and may be a payload of 133 bytes."""
-
-MOST_DEPTH_MOVED = 1 << 19
-"""Pixels of depth that the edge moves into one image, however large that is: all of 848 x 480, each second row and
-column of 1280 x 720. Without a bound, 1280 x 1280 cost .11 s a frame, and .55 s where its lens was new."""
-
-MAX_DEPTH_RAYS_BYTES = 96 << 20
-"""Rays of depth sensors' lenses that the edge keeps, 12 bytes for each pixel that it moves into the image: those of 24
-lenses of 640 x 480 or 8 of 1280 x 720. Bounded, because a hostile sender's lens may differ in each frame."""
 
 MAX_DEPTH_GAP_NS = 10**10
 """Time between an image and its depth. Streams of a camera are some 100 ms apart, replays of a slow sensor seconds."""
@@ -51,9 +36,6 @@ MAX_JPEG_SCANS = 16
 
 MAX_ID_CHARS = 64
 """Length of a camera or session id, which becomes part of file names and ledger lines."""
-
-MAX_POLICY_CHARS = 1024
-"""Length of a policy's name, which may contain a file's path."""
 
 MAX_PEER_TEXT_CHARS = 200
 """Length of a peer's text in a log line."""
@@ -77,36 +59,6 @@ MAX_FILE_BYTES = 2**30
 MAX_ERROR_CHARS = 1000
 """Length of a quotation from a file in an error message."""
 
-MAX_MODEL_BYTES = 4 * 2**30
-"""Memory for all ONNX models of a process together: four times the need of the largest YOLO11 for a batch. A
-larger allocation fails, whatever sizes the file states."""
-
-MAX_MODEL_FILE_BYTES = 512 * 2**20
-"""Size of an ONNX model's file: twice the largest detectors of the family, 230 MB."""
-
-MAX_GRAPH_NODES = 10_000
-"""Nodes of an ONNX model: three times the largest of the family, quantized. ONNX Runtime takes 1 s to load a chain of
-so many, 12 s of 30,000."""
-
-MAX_TENSOR_ELEMENTS = 2**26
-"""Largest tensor of an ONNX model per image: six times the largest of YOLO11x at 640 pixels."""
-
-MAX_MODEL_SIDE_PX = 2048
-"""Width and height of the images that an ONNX model takes."""
-
-MAX_HIDDEN, MAX_OMEGAS, MAX_FIRST_WEIGHTS = 1024, 4096, 2**22
-"""Width of a learned policy's layers, number of its waiting times, weights of its first layer. These bound what is
-allocated for a policy's file: with both networks and Adam's moments half a gigabyte, far more than a decision needs."""
-
-MAX_STATE_DIM = 4096
-"""Width of the embedding in a learned policy's state: the widest that can be configured."""
-
-MAX_LEARNER_BYTES = 2**29
-"""Unpacked size of a learned policy's file: both networks and Adam's moments at their largest."""
-
-MAX_ANSWER_BYTES = 2**10
-"""Body of an answer to the preference page: a hundred bytes would do."""
-
 # --- streams and cameras ----------------------------------------------------------------------
 
 MAX_CAMERAS = 1000
@@ -115,34 +67,6 @@ MAX_CAMERAS = 1000
 MAX_STREAMS_PER_CAMERA = 4
 """Number of open streams at a process, for each of its cameras: one is in use, others may be closing after a
 restart. Beyond that a new stream ends the one of least use."""
-
-MAX_WATCHERS = 32
-"""Number of watchers of decisions at once. Each looks at the state twenty times a second."""
-
-MAX_SCRAPES = 8
-"""Number of open connections to the metrics, or to the preference page; a new one ends the oldest."""
-
-SCRAPE_TIMEOUT_S = 5.0
-"""How long such a connection may send nothing."""
-
-MAX_VISITORS = 32
-"""Number of visitors of the page at once. One who does not read costs the data sent first, some megabytes."""
-
-VISITOR_TIMEOUT_S = 30.0
-"""How long a visitor may leave sent data unread: a slow line receives the first megabytes in that time."""
-
-MAX_VISITOR_MESSAGE_BYTES = 2**16
-"""Size of a visitor's message: viewpoints, clicks and values of controls take less than a kilobyte."""
-
-MAX_CLICKS_HZ = 50.0
-"""Rate of a visitor's clicks on controls and cameras, and their burst: a number's arrow, held, makes 40."""
-
-MAX_VIEW_SIDE_PX = 16384
-"""Width and height of a visitor's window: more than any screen has."""
-
-MAX_PAGE_CONNECTIONS = 128
-"""Number of connections to the page at once, of visitors and requests: a browser opens six. A new one ends
-the oldest request. With TLS the same number may be in their handshake, of which a new one ends the oldest."""
 
 TLS_HANDSHAKE_TIMEOUT_S = 5.0
 """How long a connection to the page or to gRPC may last without a completed handshake."""
@@ -155,18 +79,12 @@ its cameras."""
 GRPC_IDLE_S = 60.0
 """How long a connection to gRPC may last without a call; then it ends. Clients connect again."""
 
-MAX_QUEUED_BYTES = 256 * 2**20
-"""Size of all frames inside the emulator's links: 2.5 s of a thousand cameras with 100 kB a second."""
-
 MAX_CONCURRENT_STREAMS = 1024
 """Streams of a gRPC connection: one for each camera of the largest scenario, and some further calls."""
 
 MAX_CALLS = 3 * MAX_CAMERAS
 """Open calls of a server, on all its connections, unless it says how many it needs: three for each camera of the
 largest scenario. A new one ends one that carried nothing."""
-
-MAX_OTHER_CALLS = 100
-"""Open calls besides the streams of frames: clock exchanges, health, reflection."""
 
 MAX_PENDING_CALLS = 1000
 """Calls that came and wait to be handled: all cameras of the largest scenario may connect at once. More are refused,
@@ -183,13 +101,6 @@ SESSION_IDLE_NS = 2 * 10**9
 notice opens another one."""
 
 # --- time -------------------------------------------------------------------------------------
-
-LONGEST_MS = 3_600_000.0
-"""Longest wait, period, deadline or update: in an hour every scene has changed."""
-
-MAX_STAMP_S = 4.6e9
-"""Absolute value of a time stamp in a file: the difference of two fits in 64 bits of nanoseconds. Counted
-from 1970 it is the year 2115; larger ones have another unit."""
 
 MAX_CAPTURE_AHEAD_NS = 250_000_000
 """How far a capture may be ahead of the edge's clock, beyond the uncertainty of the node's offset."""
@@ -223,8 +134,3 @@ MAX_CENTER_OUTSIDE_SIDES = 1.0
 
 MAX_LENS_ERROR_PX = 1.0
 """Distance of a pixel from itself after undistortion and projection; a lens with more cannot be inverted."""
-
-MAX_SET_DELAY_MS = 10_000.0
-"""Mean delay that an operator may set: with more, a run would show nothing but its own start."""
-MAX_CHANNEL_CHANGES = 256
-"""Of operators, that the emulator's status keeps; it is written twice a second. Older ones are in the log."""

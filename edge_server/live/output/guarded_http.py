@@ -14,7 +14,6 @@ from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 from edge_server.live import live_constants as tuned
 from freshfield.access import HttpDoor, HttpRefused
-from freshfield.limits import MAX_SCRAPES, SCRAPE_TIMEOUT_S
 from freshfield.transport import Transport, TransportError
 
 log = logging.getLogger(__name__)
@@ -24,14 +23,14 @@ CALLER = "freshfield.caller"
 
 
 class _Handler(WSGIRequestHandler):
-    timeout = SCRAPE_TIMEOUT_S  # of each read of the socket
+    timeout = tuned.SCRAPE_TIMEOUT_S  # of each read of the socket
 
     def log_message(self, *_: Any) -> None:
         """Requests are not worth a line."""
 
 
 class _Server(ThreadingMixIn, WSGIServer):
-    """One thread per connection. If there are more than MAX_SCRAPES, a new connection ends the oldest."""
+    """One thread per connection. If there are more than tuned.MAX_SCRAPES, a new connection ends the oldest."""
 
     daemon_threads = True
     request_queue_size = tuned.WAITING_CONNECTIONS
@@ -45,7 +44,7 @@ class _Server(ThreadingMixIn, WSGIServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         with self._lock:
             self._open.append(request)
-            if len(self._open) > MAX_SCRAPES:
+            if len(self._open) > tuned.MAX_SCRAPES:
                 with contextlib.suppress(OSError):  # its thread reads the end of the request
                     self._open.pop(0).shutdown(socket.SHUT_RDWR)
         super().process_request(request, client_address)

@@ -17,8 +17,8 @@ from typing import Any
 
 from edge_server.live.output.guarded_http import CALLER, serve_guarded
 from edge_server.page import PageError, page_url
+from edge_server.page import page_constants as tuned
 from edge_server.viewpoints.preference_session import PreferenceSession
-from freshfield import limits
 from freshfield.access import CHANGE
 from freshfield.transport import Transport
 
@@ -172,8 +172,8 @@ def _message(body: bytes) -> dict[str, Any]:
 
 def _body(environ: dict[str, Any]) -> bytes:
     length = environ.get("CONTENT_LENGTH") or "0"
-    if not (length.isascii() and length.isdigit() and len(length) < 10) or int(length) > limits.MAX_ANSWER_BYTES:
-        raise _Refused(413, f"At most {limits.MAX_ANSWER_BYTES // 2**10} KiB.")
+    if not (length.isascii() and length.isdigit() and len(length) < 10) or int(length) > tuned.MAX_ANSWER_BYTES:
+        raise _Refused(413, f"At most {tuned.MAX_ANSWER_BYTES // 2**10} KiB.")
     try:
         body: bytes = environ["wsgi.input"].read(int(length))
     except OSError:

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
+from edge_server.scheduler.learned import learning_constants as tuned
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import State
-from freshfield import limits
 
 KIND = "scheduler"
 """Kind of file that a learner's checkpoint declares."""
@@ -71,7 +71,7 @@ class Actor:
     def load(path: Path | str) -> Actor:
         """The actor of a learner's checkpoint. checkpoint.CheckpointError (a ValueError) for any other
         file."""
-        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=limits.MAX_LEARNER_BYTES)
+        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=tuned.MAX_LEARNER_BYTES)
         spec = read_spec(path, about)
         expected = networks.init_actor(spec, np.random.default_rng(0))
         found: dict[str, NDArray[np.float64]] = {}

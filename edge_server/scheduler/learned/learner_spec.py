@@ -7,10 +7,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from edge_server.edge_constants import LONGEST_MS
 from edge_server.scheduler.learned import learning_constants as tuned
 from edge_server.scheduler.learned.state import StateLayout, require_int
-from freshfield import limits
-from freshfield.limits import LONGEST_MS
 
 Action = Literal["select", "wait", "wait-arrived", "threshold"]
 ACTIONS: tuple[Action, ...] = ("select", "wait", "wait-arrived", "threshold")
@@ -52,16 +51,16 @@ class Spec:
             raise ValueError(f"action {self.action!r} is not known; choose one of {', '.join(ACTIONS)}")
         if (self.action == "select") != (not self.omegas_ms):
             raise ValueError(f"action {self.action}: all but select need omegas_ms, and select takes none")
-        if len(self.omegas_ms) > limits.MAX_OMEGAS:
-            raise ValueError(f"omegas_ms: expected at most {limits.MAX_OMEGAS}, got {len(self.omegas_ms)}")
+        if len(self.omegas_ms) > tuned.MAX_OMEGAS:
+            raise ValueError(f"omegas_ms: expected at most {tuned.MAX_OMEGAS}, got {len(self.omegas_ms)}")
         rising = all(a < b for a, b in zip(self.omegas_ms, self.omegas_ms[1:]))
         if not rising or not all(0 <= o <= LONGEST_MS for o in self.omegas_ms):
             raise ValueError(f"omegas_ms: expected values from 0 to {LONGEST_MS:.0f}, rising, got {self.omegas_ms}")
-        require_int("hidden", self.hidden, 1, limits.MAX_HIDDEN)
+        require_int("hidden", self.hidden, 1, tuned.MAX_HIDDEN)
         require_int("passes", self.passes, 1, 10_000)
         require_int("minibatch", self.minibatch, 1, 2**31)
         first = self.layout.width * self.hidden
-        if first > limits.MAX_FIRST_WEIGHTS:
+        if first > tuned.MAX_FIRST_WEIGHTS:
             raise ValueError(
                 f"a first layer of {first} weights is larger than any that is trained here: a smaller dim or hidden"
             )

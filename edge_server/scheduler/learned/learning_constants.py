@@ -38,6 +38,13 @@ MIN_ADVANTAGE_STD = 0.05
 # Decisions that count in the running statistics, which follow a scene or a channel that changes.
 REMEMBERED_DECISIONS = 4096
 
+# --- what a policy's file may hold at most (learner_spec, state, actor, ppo) ---
+# Width of its layers, number of its waiting times, weights of its first layer: these bound what is allocated. With both
+# networks and Adam's moments that is half a gigabyte, far more than a decision needs.
+MAX_HIDDEN, MAX_OMEGAS, MAX_FIRST_WEIGHTS = 1024, 4096, 2**22
+MAX_STATE_DIM = 4096  # width of the embedding in a state: the widest that can be configured
+MAX_LEARNER_BYTES = 2**29  # its unpacked size: both networks and Adam's moments at their largest
+
 # --- decisions on disk, and what explains them (decision_record, explain) ---
 KEPT_DECISIONS = 500  # latest decisions of a run that stay on disk
 KEPT_DECISIONS_BYTES = 64_000_000  # most that they take together: beyond it, fewer stay

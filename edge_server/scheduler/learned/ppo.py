@@ -33,7 +33,6 @@ from edge_server.scheduler.learned.actor import KIND, Actor, read_spec
 from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.torch_threads import one_torch_thread
-from freshfield import limits
 
 # Rewards that vary by less than this share of their size, or of all rewards' standard deviation, are
 # constant.
@@ -184,7 +183,7 @@ class Learner:
     @staticmethod
     def load(path: Path | str) -> Learner:
         """A learner as ``save`` left it. checkpoint.CheckpointError (a ValueError) for anything else."""
-        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=limits.MAX_LEARNER_BYTES)
+        arrays, about = checkpoint.load(path, kind=KIND, most_bytes=tuned.MAX_LEARNER_BYTES)
         spec = read_spec(path, about)
         if "seed" not in about:
             raise checkpoint.CheckpointError(

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.scheduler.learned import learning_constants as tuned
-from freshfield import limits
 
 if TYPE_CHECKING:
     from freshfield.frame import Frame
@@ -87,7 +86,7 @@ class StateLayout:
             raise ValueError(f"state: no part is called {', '.join(unknown)}; there are {', '.join(STATE_PARTS)}")
         if not self.parts:
             raise ValueError(f"state: no parts; choose some of {', '.join(STATE_PARTS)}")
-        require_int("state: dim", self.dim, 0, limits.MAX_STATE_DIM)
+        require_int("state: dim", self.dim, 0, tuned.MAX_STATE_DIM)
         if ("semantics" in self.parts) != (self.dim > 0):
             raise ValueError(f"state: dim {self.dim} with parts {', '.join(self.parts)}: semantics has a dim")
         if not (0 < self.age_scale_ms < np.inf and 0 < self.oldest_ms < np.inf):

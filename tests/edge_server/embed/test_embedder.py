@@ -9,7 +9,6 @@ import pytest
 from edge_server.embed.cache import EmbeddingCache
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield.frame import Frame
-from freshfield.limits import MAX_GRAPH_NODES
 from tests.edge_server.frames import damaged_frame, frame
 from tests.support import refused
 
@@ -19,6 +18,7 @@ pytest.importorskip("onnx", reason="the extra embed is not installed")
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
+from edge_server.edge_constants import MAX_GRAPH_NODES
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
 from edge_server.embed.letterbox import GRAY
 from freshfield import payload

@@ -24,7 +24,7 @@ from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
-from edge_server.live.live_constants import MAX_SNAPSHOTS, STOP_S
+from edge_server.live.live_constants import MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS, STOP_S
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.scheduler.learned.actor import Actor
@@ -37,7 +37,6 @@ from freshfield import scenario
 from freshfield.frame import to_request
 from freshfield.geometry import Pose, look_at
 from freshfield.ledger import read_all
-from freshfield.limits import MAX_SCRAPES, MAX_WATCHERS
 from freshfield.transport import Transport, TransportError
 from freshfield.v1 import clock_pb2, clock_pb2_grpc, edge_pb2, edge_pb2_grpc, frames_pb2, frames_pb2_grpc
 from freshfield_up.launcher_constants import GRACE_S

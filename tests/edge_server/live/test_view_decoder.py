@@ -7,10 +7,10 @@ import pytest
 
 from edge_server.live import depth_in_image as module
 from edge_server.live.depth_in_image import depth_in_image
+from edge_server.live.live_constants import MAX_DEPTH_POINTS, MOST_DEPTH_MOVED
 from edge_server.live.view_decoder import ViewDecoder
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
-from freshfield.limits import MAX_DEPTH_POINTS, MOST_DEPTH_MOVED
 from tests.edge_server.frames import damaged_frame, frame
 
 

@@ -16,12 +16,13 @@ import pytest
 import websocket
 
 from edge_server.live.keys_command import make_keys
+from edge_server.live.live_constants import MAX_SCRAPES
 from edge_server.live.output import guarded_http
 from edge_server.live.output.prometheus import serve_metrics
 from edge_server.page import Page, access_guard, start_page
 from edge_server.page.access_guard import AccessGuard
+from edge_server.page.page_constants import MAX_VISITOR_MESSAGE_BYTES
 from freshfield.access import HttpDoor
-from freshfield.limits import MAX_SCRAPES, MAX_VISITOR_MESSAGE_BYTES
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.preview import BallScene, bare_state, publication
 from tests.edge_server.page.visitor import CAMERA, Visitor, ask, page_of

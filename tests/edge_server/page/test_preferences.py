@@ -10,9 +10,9 @@ import pytest
 
 from edge_server.live import live_constants as tuned
 from edge_server.page import PageError
+from edge_server.page.page_constants import MAX_ANSWER_BYTES
 from edge_server.page.preferences import PreferencePage
 from edge_server.viewpoints.preference_session import PreferenceSession
-from freshfield.limits import MAX_ANSWER_BYTES
 from freshfield.transport import Transport, TransportError
 from tests.edge_server.page.browser import Browser
 from tests.edge_server.page.visitor import ask

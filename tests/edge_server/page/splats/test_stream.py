@@ -13,9 +13,9 @@ import pytest
 import websocket
 
 from edge_server.page import Page, start_page
+from edge_server.page.page_constants import MAX_VISITORS
 from edge_server.page.splats.messages import StreamReader, read_saved
 from edge_server.page.splats.stream import STREAM, SplatStream
-from freshfield.limits import MAX_VISITORS
 from freshfield.transport import Transport
 from tests.edge_server.fields.scenes import psnr
 from tests.edge_server.page.browser import Browser

@@ -11,13 +11,12 @@ import torch
 
 from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import distributions as d
-from edge_server.scheduler.learned import networks, ppo
+from edge_server.scheduler.learned import learning_constants, networks, ppo
 from edge_server.scheduler.learned.actor import Actor
 from edge_server.scheduler.learned.clipped_update import Acted, UpdateFigures, clipped_update
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Diagnostics, Learner, _RunningMeanStd
 from edge_server.scheduler.learned.state import State, StateLayout
-from freshfield import limits
 from tests.edge_server.scheduler.learned import problems
 from tests.edge_server.scheduler.learned.problems import FreshOnes, Waits, act, batch_of, collect, state, teach, value
 from tests.support import refused
@@ -133,7 +132,7 @@ def test_what_no_learner_has_saved_is_refused_in_one_line_before_anything_is_all
 
 
 def test_an_archive_that_grows_when_it_is_unpacked_is_not_unpacked(tmp_path, monkeypatch):
-    monkeypatch.setattr(limits, "MAX_LEARNER_BYTES", 2**22)
+    monkeypatch.setattr(learning_constants, "MAX_LEARNER_BYTES", 2**22)
     path = tmp_path / "policy.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
         packed.writestr("actor.in.npy", bytes(2**22 + 1))
