@@ -42,6 +42,7 @@ TRACKER_JOIN_S = 2.0  # for its thread to end
 # Absolute value of a time stamp in a file: the difference of two fits in 64 bits of nanoseconds. Counted from 1970 it
 # is the year 2115; larger ones have another unit.
 MAX_STAMP_S = 4.6e9
+MAX_GAP_MS = 3.6e6  # between a frame and its pose sample: poses an hour away belong to another recording
 
 # --- the folder of rendered frames (synthetic.frame_cache) ---
 # Here, since what the files of ``synthetic`` say is part of the key of rendered frames.

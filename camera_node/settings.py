@@ -14,9 +14,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from msgspec import Meta, field
+from msgspec import field
 
-from camera_node.node_constants import MAX_STAMP_S
+from camera_node.node_constants import MAX_GAP_MS, MAX_STAMP_S
+from camera_node.robot.arm.settings import ArmConfig
 from camera_node.sources.source_constants import FIRST_FRAME_S
 from freshfield import plugins
 from freshfield.limits import MAX_IMAGE_SIDE_PX
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 Background = Literal["white", "black", "keep"]
 FPS_RANGE = (0.01, 1000.0)
 """Bounds of a rate of captures or of a recording, frames a second."""
-MAX_GAP_MS = 3.6e6
-"""Longest time between a frame and its pose sample: poses an hour away belong to another recording."""
 ZJU_FPS = 50.0
 """Assumed rate of ZJU-MoCap's studio, which its files do not tell."""
 MAX_LATENCY_MS = 6e4
@@ -52,58 +51,6 @@ class SourceConfig(Settings, frozen=True, kw_only=True):
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
 
     waits: ClassVar[bool] = False  # whether captures wait for hardware: in threads of their own, never in virtual time
-
-
-Elevation = Annotated[float, within(-89.0, 89.0, "elevations of the rings")]
-Roll = Annotated[float, within(-360.0, 360.0, "allowed rotations about the optical axis")]
-
-
-class PathConfig(Settings, frozen=True):
-    """The tour that ``camera-node drive-arm`` makes: viewpoints on rings around a target, looking at it.
-
-    Azimuth 0 is on the target's -y side, 90 on its +x side. At each viewpoint the first rotation is used that the arm
-    reaches.
-    """
-
-    target_m: Annotated[tuple[float, float, float], about("target in the world")] = (0.0, 0.0, 0.0)
-    radius_m: Annotated[float, within(1e-3, math.inf, "distance from camera to target")] = 0.35
-    elevations_deg: Annotated[tuple[Elevation, ...], Meta(min_length=1)] = (45.0, 65.0)
-    azimuths_deg: Annotated[tuple[float, float], about("first and last of each ring")] = (-90.0, 90.0)
-    step_deg: Annotated[float, within(1.0, 120.0, "between viewpoints of a ring")] = 15.0
-    rolls_deg: Annotated[tuple[Roll, ...], Meta(min_length=1)] = (0.0, 90.0, 180.0, 270.0)
-    speed_rad_s: Annotated[float, within(1e-4, 3.14, "limit of the fastest joint")] = 0.5
-    acceleration_rad_s2: Annotated[float, within(1e-4, 40.0, "limit of the fastest joint")] = 1.0
-    floor_m: Annotated[float, about("least height (world z) of the joint centers beyond the shoulder")] = 0.05
-
-
-class ArmConfig(Settings, frozen=True):
-    """An arm whose joint states give cameras their poses (extra ``ur``).
-
-    cameras: files of ``camera-node calibrate hand-eye``, relative to the scenario; null before calibration: poses are
-    then those of the flange, as that command needs them.
-    simulated: the launcher starts ``camera-node simulate-arm`` at ``host`` (an address of this machine, 127.0.0.2 and
-    up) and drives it.
-    """
-
-    host: Annotated[str, about("the controller's address")]
-    cameras: Annotated[dict[str, str | None], about("camera -> its hand-eye calibration")]
-    robot: Literal["ur3e"] = "ur3e"
-    calibration: Annotated[str | None, about("the robot's own calibration.conf, relative to the scenario")] = None
-    base_m: Annotated[tuple[float, float, float], about("position of the arm's base in the world")] = (0.0, 0.0, 0.0)
-    base_yaw_deg: Annotated[float, about("rotation of the arm's base about the vertical")] = 0.0
-    frequency_hz: Annotated[float, within(10, 500, "joint states per second")] = 125.0
-    pairing: Literal["nearest", "interpolated"] = "interpolated"
-    max_gap_ms: Annotated[float, within(0, MAX_GAP_MS, "largest gap from frame to joint state")] = 20.0
-    path: Annotated[PathConfig | None, about("the tour of camera-node drive-arm")] = None
-    simulated: bool = False
-    teleop: Annotated[dict[str, Any] | None, about("keys for camera-node teleop")] = None  # read by that command alone
-
-    def __post_init__(self) -> None:
-        if not self.cameras:
-            raise ValueError("cameras: expected at least one camera with its hand-eye calibration")
-        # drive-arm does not ask before it moves a simulated arm: a real one must not pass for one.
-        if self.simulated and not self.host.startswith("127."):
-            raise ValueError(f"simulated: host is {self.host}, expected one of this machine's, such as 127.0.0.2")
 
 
 class WorldConfig(SourceConfig, frozen=True, kw_only=True):

@@ -26,8 +26,8 @@ from typing import Any
 
 from camera_node.doctor import doctor_constants as tuned
 from camera_node.pose.providers import Closable, PoseGapError
+from camera_node.robot.arm.settings import ArmConfig
 from camera_node.settings import (
-    ArmConfig,
     LiveConfig,
     McapConfig,
     RecordedConfig,

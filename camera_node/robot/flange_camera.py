@@ -19,10 +19,10 @@ import numpy as np
 from camera_node.pose.providers import PoseGapError, PoseProvider
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, camera_poses, load_hand_eyes
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.arm.settings import ArmConfig
 from camera_node.robot.simulated_controller import TRUTH_PORT
 from camera_node.robot.simulated_controller import simulated_controller_constants as tuned
 from camera_node.robot.simulated_controller.joint_motion import STEP_S
-from camera_node.settings import ArmConfig
 from freshfield.geometry import Array, Pose
 from freshfield.scenario import Scenario
 

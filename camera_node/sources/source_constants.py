@@ -32,7 +32,7 @@ BLOCK_FRAMES = 12  # videos decode only forwards: to play backwards, this many (
 # OpenCV, which seeks by the mean rate, finds none.
 ENDING_FRAMES = (4, SKIP_FRAMES)
 
-# --- recorded bags (datasets.rgbd.recording) ---
+# --- recorded bags (datasets.rgbd.recorded_messages) ---
 # Time within which an image of a recorded bag gets a depth image: less than half a period of 15 images a second.
 RECORDING_DEPTH_NEAR_NS = 20_000_000
 # Largest gap from such an image to a sample of its frame's own transform: half a period of 10 samples a second.

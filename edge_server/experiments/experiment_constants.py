@@ -1,4 +1,4 @@
-"""Numbers of experiments; those of the engine and of studies stand in their folders."""
+"""Numbers of experiments; those of engine and studies stand in their folders, of viewpoints in that of the server."""
 
 from __future__ import annotations
 
@@ -58,6 +58,14 @@ LEAST_SCORED_WEIGHT = 0.5
 # Instants lie on a grid that contains MOVING_LAGS_MS of ``fidelity_constants``, so that evaluations share renderings of
 # the truth: one costs ten times a score.
 INSTANT_GRID_MS = 10
+EPISODES, EPISODES_A_BATCH = 600, 10  # of a training; of one update of the policy
+# Random instants of an episode at which something is decided, the last SPAN_MS of it after LEAD_MS; longest wait.
+DECISIONS, LEAD_MS, SPAN_MS, HORIZON_MS = 4, 1000.0, 6000.0, 2000.0
+ACTION_SAMPLES = 2  # actions that are tried at each decision
+TRAINING_SIDE_PX = 64  # of the images of synthetic scenes
+# The warm field of an episode: steps before the first decision, steps of an update where nothing says them, and how
+# long before a decision it learns the newest frames.
+WARM_STEPS, UPDATE_STEPS, REFRESH_MS = 150, 100, 300.0
 TRUTHS_KEPT = 8192  # renderings of held-out cameras kept in memory
 TRAINING_STEPS, SCRATCH_STEPS = 20, 50  # optimizer steps of an update; of one that starts with an empty field
 # Options with which ``splat`` learns the small images of a training faster than with its defaults: half of its
@@ -72,17 +80,3 @@ FRONTIER_COSTS_S = 1.0  # of virtual time, in which costs are measured
 FRONTIER_LEAD_S = 5.0  # of virtual time, until what is shown counts
 LAYERS_S = 0.02  # shortest update time of layers, as used in scenarios with layers
 STATIC_STEPS_PER_S = 250.0  # of the static field of layers, whose steps run on another core
-
-# --- viewpoints (viewpoints.stage, viewpoints.viewpoints_command) ---
-HELD_OUT_VIEWPOINTS = 20  # of a synthetic scene, between the candidates in their sector
-PLANNED_VIEWS = 8  # of each reconstruction that is compared with others, if the budget is only in meters
-STAGE_EMBEDDING_DIM = 8  # numbers per image that policies over viewpoints are taught with
-# How near to a camera the field of a capture may have density, as a share of the cameras' distance from the target.
-NEAR_OF_RADIUS = 0.3
-
-# --- what people who are asked are shown (viewpoints.reconstructions, viewpoints.asking) ---
-PATH_FRAMES, PATH_COLUMNS = 24, 6  # images of a reconstruction along the path; columns of them in their common JPEG
-PATH_WIDEST_PX = 320  # largest width of such an image
-PATH_FARTHEST_DEG = 60.0  # most that the path turns to each side of its middle
-PATH_JPEG_QUALITY = 92  # from 0 to 100: its artifacts must not affect the comparison
-PLAN_SHOWN_S = 10.0  # time that the page has to fetch the plan, before the server ends

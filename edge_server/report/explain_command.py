@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.command import command_parser, exit_status
+from edge_server.matplotlib_figures import BLUE, GRAY, VERMILION, figure
 from edge_server.report import report_constants as tuned
-from edge_server.report.style import BLUE, GRAY, VERMILION, figure
 from edge_server.scheduler.learned.decision_record import RecordedDecision, read_decision
 from edge_server.scheduler.learned.explain import EmbedImages, Explanation, explain, occlusion_map
 

@@ -12,9 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from edge_server.fidelity.scorer import SELECTED, fidelity_title
+from edge_server.matplotlib_figures import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, label_lines
 from edge_server.report import report_constants as tuned
 from edge_server.report.run_files import RunFiles
-from edge_server.report.style import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, label_lines
 
 Report = dict[str, Any]
 

@@ -20,10 +20,10 @@ from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import networks
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.state import State, StateLayout
+from edge_server.viewpoints import viewpoint_constants as tuned
 from edge_server.viewpoints.candidates import Candidates, ViewpointError
 from edge_server.viewpoints.features import GEOMETRY, StepFeatures
 from edge_server.viewpoints.registry import CaptureState
-from edge_server.viewpoints.viewpoint_constants import ANY_KL, CLOSED, ENTROPY, PASSES, STEP_MS
 from freshfield.geometry import so3_log
 
 Array = NDArray[np.float64]
@@ -43,12 +43,12 @@ class PolicyConfig:
     hidden, learning_rate: as in ``learner_spec.Spec``.
     """
 
-    views: int = 8
-    updates: int = 60
-    episodes: int = 16
-    way: float = 0.4
-    hidden: int = 32
-    learning_rate: float = 3e-3
+    views: int = tuned.POLICY_VIEWS
+    updates: int = tuned.POLICY_UPDATES
+    episodes: int = tuned.POLICY_EPISODES
+    way: float = tuned.WAY
+    hidden: int = tuned.POLICY_HIDDEN
+    learning_rate: float = tuned.POLICY_RATE
 
 
 class Rows:
@@ -72,7 +72,7 @@ class Rows:
         candidates = self.steps.candidates
         ages = np.full(len(candidates), np.inf)
         for age, k in enumerate(reversed(order)):
-            ages[k] = age * STEP_MS
+            ages[k] = age * tuned.STEP_MS
         # What is not captured yet has the usual embedding, which is 0 once it is standardized.
         seen = np.tile(self.layout.center[len(GEOMETRY) :], (len(candidates), 1))
         if self.embeddings is not None and len(order):
@@ -93,7 +93,7 @@ def layout_of(steps: StepFeatures, embeddings: Array | None, views: int, rng: np
     center = np.concatenate([part.mean(axis=0) for part in parts])
     spread = np.concatenate([np.maximum(part.std(axis=0), 1e-3) for part in parts])
     return StateLayout(
-        dim=len(center), age_scale_ms=STEP_MS, center=tuple(center.tolist()), spread=tuple(spread.tolist())
+        dim=len(center), age_scale_ms=tuned.STEP_MS, center=tuple(center.tolist()), spread=tuple(spread.tolist())
     )
 
 
@@ -172,9 +172,9 @@ def train_policy(
         layout,
         hidden=config.hidden,
         learning_rate=config.learning_rate,
-        passes=PASSES,
-        entropy=ENTROPY,
-        target_kl=ANY_KL,
+        passes=tuned.PASSES,
+        entropy=tuned.ENTROPY,
+        target_kl=tuned.ANY_KL,
     )
     rows = Rows(candidates, embeddings, layout)
     usual = np.concatenate([reward(steps.actions([k]))[usable] for k in usable[:: max(len(usable) // 8, 1)]])
@@ -214,7 +214,7 @@ def _episodes(
         closed = np.tile(~rows.steps.candidates.reachable, (count, 1))
         for line, order in zip(closed, orders):
             line[order] = True
-        logits = np.where(closed, CLOSED, networks.logits(np, spec, actor, features))
+        logits = np.where(closed, tuned.CLOSED, networks.logits(np, spec, actor, features))
         logps = logits - np.logaddexp.reduce(logits, axis=1, keepdims=True)
         chosen = np.argmax(logps + rng.gumbel(size=logps.shape), axis=1)
         taken = np.stack([rows.steps.actions(order)[k] for order, k in zip(orders, chosen)])
@@ -250,7 +250,7 @@ def _improve(
 
     def evaluate(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         logits = networks.logits(torch, spec, actor, features[some])
-        logps = torch.log_softmax(logits.masked_fill(closed[some], CLOSED), dim=-1)
+        logps = torch.log_softmax(logits.masked_fill(closed[some], tuned.CLOSED), dim=-1)
         now = logps.gather(1, chosen[some, None])[:, 0]
         entropy = -(logps.exp() * logps).masked_fill(closed[some], 0.0).sum(dim=-1)
         return now, entropy, networks.value(torch, critic, features[some])

@@ -171,7 +171,9 @@ class Pose:
         if np.abs(m[3:] - _LAST_ROW).max(initial=0.0) > 1e-6:
             raise GeometryError("the pose's last row is not 0 0 0 1: is it transposed?")
         r = m[:3, :3]
-        if np.abs(r @ r.T - np.eye(3)).max() > MAX_QUATERNION_ERROR or np.linalg.det(r) < 0:
+        # Elements first: the products of huge ones overflow.
+        sheared = np.abs(r).max() > 2.0 or np.abs(r @ r.T - np.eye(3)).max() > MAX_QUATERNION_ERROR
+        if sheared or np.linalg.det(r) < 0:
             raise GeometryError("the pose's rotation is not orthonormal and right-handed")
         q = matrix_to_quaternion(r)
         return Pose(tuple(map(float, q)), tuple(map(float, m[:3, 3])))  # type: ignore[arg-type]

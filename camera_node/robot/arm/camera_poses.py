@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from camera_node.pose.providers import FixedPose, PoseProvider
 from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, HandEye, read_hand_eye
 from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
-from camera_node.settings import ArmConfig, beside, errors_of, source_config
+from camera_node.robot.arm.settings import ArmConfig
+from camera_node.settings import beside, errors_of, source_config
 from freshfield.clock import WallClock
 from freshfield.geometry import Pose, se3, so3_exp
 from freshfield.scenario import Scenario, ScenarioError

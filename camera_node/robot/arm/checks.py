@@ -9,8 +9,8 @@ import numpy as np
 from camera_node.robot.arm.arm_constants import LEAST_REACHED, LEAST_STATES, LISTEN_S
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes, mount_on_flange
 from camera_node.robot.arm.joint_states import ArmStream
+from camera_node.robot.arm.settings import ArmConfig, PathConfig
 from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
-from camera_node.settings import ArmConfig, PathConfig
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
 

@@ -17,7 +17,7 @@ import numpy as np
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.arm_constants import CONTROL_S, DRIVE_HZ, SIMULATED_STALE_S, STALE_S, STOPPING_S
 from camera_node.robot.arm.joint_states import ArmStream, probe
-from camera_node.settings import ArmConfig
+from camera_node.robot.arm.settings import ArmConfig
 from freshfield.clock import WallClock
 
 log = logging.getLogger("camera-node.arm")

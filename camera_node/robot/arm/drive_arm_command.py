@@ -29,8 +29,9 @@ from camera_node.robot.arm.control import (
     stop_within_timeout,
 )
 from camera_node.robot.arm.joint_states import ArmStream
+from camera_node.robot.arm.settings import PathConfig
 from camera_node.robot.arm.viewpoint_tour import Tour, plan_tour
-from camera_node.settings import PathConfig, errors_of
+from camera_node.settings import errors_of
 from freshfield.scenario import ScenarioError, load
 
 

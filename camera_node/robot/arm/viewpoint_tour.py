@@ -19,7 +19,7 @@ from camera_node.robot.arm import ArmError
 from camera_node.robot.arm import arm_constants as tuned
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.settings import PathConfig
+from camera_node.robot.arm.settings import PathConfig
 from freshfield.geometry import Array, on_sphere, se3, se3_inverse, so3_exp
 
 

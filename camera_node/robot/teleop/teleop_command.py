@@ -16,13 +16,13 @@ from camera_node.robot.arm.camera_poses import arm_model, require_arm
 from camera_node.robot.arm.control import confirm_motion, open_stream, stop_event
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.arm.settings import ArmConfig
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop import teleop_constants as tuned
 from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus, open_stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
-from camera_node.settings import ArmConfig
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario, load
 from freshfield.settings import read_settings

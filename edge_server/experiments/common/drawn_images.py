@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.experiments import experiment_constants as tuned
-from edge_server.report.style import figure
+from edge_server.matplotlib_figures import figure
 
 Image = NDArray[np.uint8]
 

@@ -1,4 +1,4 @@
-"""Tables of results in Markdown. CSV has ``freshfield.files``, figures have ``edge_server.report.style``."""
+"""Tables of results in Markdown. CSV has ``freshfield.files``, figures have ``edge_server.matplotlib_figures``."""
 
 from __future__ import annotations
 

@@ -54,15 +54,15 @@ class Setting:
     report: tuple[str, ...] = ()
     deployed: bool = False
     motions: bool = True
-    steps: int = 100
+    steps: int = tuned.UPDATE_STEPS
     scratch: bool = False
-    warm_steps: int = 150
-    refresh_ms: float = 300.0
+    warm_steps: int = tuned.WARM_STEPS
+    refresh_ms: float = tuned.REFRESH_MS
     repeat: int = 0
-    decisions: int = 4
-    lead_ms: float = 1000.0
-    span_ms: float = 6000.0
-    horizon_ms: float = 2000.0
+    decisions: int = tuned.DECISIONS
+    lead_ms: float = tuned.LEAD_MS
+    span_ms: float = tuned.SPAN_MS
+    horizon_ms: float = tuned.HORIZON_MS
     compute: ComputeConfig = dataclasses.field(default_factory=ComputeConfig)
     parts: tuple[str, ...] = ("age", "pose")
 

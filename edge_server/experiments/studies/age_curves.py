@@ -13,7 +13,7 @@ from edge_server.experiments.studies.drawing import curves, instants
 from edge_server.experiments.studies.study import Study, StudyRequest
 from edge_server.experiments.studies.trial import Point, recording, run_points, scenes_here, sweep
 from edge_server.experiments.studies.verdicts import METRICS, Claim, interior, optimum_falls, optimum_grows
-from edge_server.report.style import CYCLE, figure, label_lines
+from edge_server.matplotlib_figures import CYCLE, figure, label_lines
 
 GAMMAS = (15.0, 21.0, 30.0, 45.0, 51.0, 60.0, 75.0, 90.0, 105.0, 120.0, 150.0, 200.0, 300.0, 400.0)
 QUICK_GAMMAS = (15.0, 30.0, 51.0, 80.0, 120.0, 200.0, 400.0)

@@ -13,7 +13,7 @@ from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.studies.study import StudyRequest
 from edge_server.experiments.studies.trial import last_images, scenes_here, usual_trial
 from edge_server.experiments.studies.verdicts import METRICS, NO_DELAY, USE_ALL
-from edge_server.report.style import CYCLE, GRAY, figure, label_lines
+from edge_server.matplotlib_figures import CYCLE, GRAY, figure, label_lines
 
 
 def draw_curve(axes: Axes, curve: Curve, label: str, place: int) -> None:

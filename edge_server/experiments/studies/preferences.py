@@ -30,7 +30,7 @@ from edge_server.experiments.viewpoints.reconstructions import taste_score, vari
 from edge_server.experiments.viewpoints.stage import Stage, open_embedder
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
-from edge_server.report.style import figure, label_lines
+from edge_server.matplotlib_figures import figure, label_lines
 from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.experts import TASTES, SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures

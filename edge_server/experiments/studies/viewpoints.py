@@ -21,7 +21,7 @@ from edge_server.experiments.viewpoints.stage import Stage, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
-from edge_server.report.style import figure, label_lines
+from edge_server.matplotlib_figures import figure, label_lines
 from edge_server.viewpoints.capture_planner import Budget, Plan, Stop, plan_capture
 from edge_server.viewpoints.registry import make_selector
 

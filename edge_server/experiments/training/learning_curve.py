@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from edge_server.experiments.experiment_constants import SMOOTHED_BATCHES
-from edge_server.report.style import CYCLE, figure, label_lines
+from edge_server.matplotlib_figures import CYCLE, figure, label_lines
 
 
 def draw_curve(path: Path, rows: Sequence[dict[str, Any]]) -> None:

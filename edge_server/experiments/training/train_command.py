@@ -10,10 +10,10 @@ from functools import partial
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import add_folders, add_workers, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import EngineError
-from edge_server.experiments.experiment_constants import QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.experiments.rollouts.setting import Setting, layout_of, reward_of, seeds
 from edge_server.experiments.training.learning_curve import draw_curve
 from edge_server.experiments.training.trainer import TrainingConfig, TrainingError, read_log, train
@@ -89,13 +89,13 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     source, edge = dict(scenario.source), dict(scenario.edge)
     if source.get("kind") == "world" and args.size:
         source |= {"width": args.size, "height": args.size}
-    edge["field"], edge["updates"], edge["field_options"] = "splat", "cycle", QUICK_SPLAT
+    edge["field"], edge["updates"], edge["field_options"] = "splat", "cycle", tuned.QUICK_SPLAT
     edge["policy"] = {"name": "all"}
     asked = args.parts.split(",")
     given = dataclasses.replace(scenario, source=source, edge=edge)
     return Setting(
         given,
-        steps=SCRATCH_STEPS if args.scratch else TRAINING_STEPS,
+        steps=tuned.SCRATCH_STEPS if args.scratch else tuned.TRAINING_STEPS,
         scratch=args.scratch,
         decisions=args.decisions,
         compute=read_config(given).compute,
@@ -133,10 +133,22 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("scenario", help="scenario file, or the name of a shipped one; needs a held-out camera")
     add("--kind", choices=ACTIONS, default="select", help="what the policy decides [%(default)s]")
-    add("--episodes", type=int, default=600, metavar="N", help="episodes of training [%(default)s]")
-    add("--decisions", type=int, default=4, metavar="N", help="decisions of an episode [%(default)s]")
-    add("--batch", type=int, default=10, metavar="N", help="episodes in one policy update [%(default)s]")
-    add("--samples", type=int, default=2, metavar="N", help="actions tried at each decision [%(default)s]")
+    add("--episodes", type=int, default=tuned.EPISODES, metavar="N", help="episodes of training [%(default)s]")
+    add("--decisions", type=int, default=tuned.DECISIONS, metavar="N", help="decisions of an episode [%(default)s]")
+    add(
+        "--batch",
+        type=int,
+        default=tuned.EPISODES_A_BATCH,
+        metavar="N",
+        help="episodes in one policy update [%(default)s]",
+    )
+    add(
+        "--samples",
+        type=int,
+        default=tuned.ACTION_SAMPLES,
+        metavar="N",
+        help="actions tried at each decision [%(default)s]",
+    )
     add("--reward", choices=tuple(REWARDS), help="reward, see above [set for select, else corrected]")
     add(
         "--on", choices=("whole", "moving"), default="whole", help="pixels that the reward's PSNR is over [%(default)s]"
@@ -159,7 +171,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--size",
         type=int,
-        default=64,
+        default=tuned.TRAINING_SIDE_PX,
         metavar="PX",
         help="pixels a side in synthetic scenes; 0: the scenario's [%(default)s]",
     )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from edge_server.experiments.viewpoints.stage import Stage
-from edge_server.report.style import CYCLE, GRAY, INK, figure
+from edge_server.matplotlib_figures import CYCLE, GRAY, INK, figure
 from edge_server.viewpoints.capture_planner import Plan
 
 

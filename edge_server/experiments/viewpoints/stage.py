@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from camera_node.settings import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
 from camera_node.synthetic.scene import Scene
 from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
-from edge_server.experiments.experiment_constants import HELD_OUT_VIEWPOINTS, NEAR_OF_RADIUS, STAGE_EMBEDDING_DIM
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.experiments.virtual.from_scenario import exact_scene
@@ -24,6 +23,7 @@ from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_poses, half_hemisphere
 from edge_server.viewpoints.policy import Embed
+from edge_server.viewpoints.viewpoint_constants import HELD_OUT_VIEWPOINTS, NEAR_OF_RADIUS, STAGE_EMBEDDING_DIM
 from freshfield.scenario import Scenario, load
 
 _BETWEEN = 0.25  # offset of ``half_hemisphere``

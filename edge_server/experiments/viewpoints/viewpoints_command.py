@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
-from edge_server.experiments.experiment_constants import PLANNED_VIEWS
 from edge_server.experiments.viewpoints.asking import ANSWERS, compare
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
+from edge_server.viewpoints import viewpoint_constants as tuned
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.capture_planner import Budget, plan_capture
 from edge_server.viewpoints.experts import TASTES
@@ -68,7 +68,7 @@ def _run(args: argparse.Namespace) -> None:
     show = None
     if args.ask:
         args.out.mkdir(parents=True, exist_ok=True)
-        views = min(budget.views or PLANNED_VIEWS, int(stage.candidates.reachable.sum()))
+        views = min(budget.views or tuned.PLANNED_VIEWS, int(stage.candidates.reachable.sum()))
         session, show = compare(
             stage,
             args.ask,
@@ -146,18 +146,24 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--travel",
         type=float,
-        default=0.2,
+        default=tuned.TRAVEL_WEIGHT,
         metavar="W",
         help="weight of path length against value, each over its range; 0: none [%(default)g]",
     )
     add(
         "--candidates",
         type=int,
-        default=100,
+        default=tuned.PLAN_CANDIDATES,
         metavar="N",
         help="number of candidates in a synthetic scene [%(default)s]",
     )
-    add("--steps", type=at_least(1), default=400, metavar="N", help="optimizer steps of each fit [%(default)s]")
+    add(
+        "--steps",
+        type=at_least(1),
+        default=tuned.PLAN_FIT_STEPS,
+        metavar="N",
+        help="optimizer steps of each fit [%(default)s]",
+    )
     add("--seed", type=at_least(0), default=0, metavar="N", help="random seed, also of the first view [%(default)s]")
     add(
         "--ask",
@@ -168,11 +174,17 @@ def _parser() -> argparse.ArgumentParser:
         help=f"compare reconstructions first, by a {PERSON} on the page (if WHO is left out) or a simulated "
         f"expert: {', '.join(TASTES)}",
     )
-    add("--questions", type=at_least(1), default=60, metavar="N", help="pairs that --ask shows [%(default)s]")
+    add(
+        "--questions",
+        type=at_least(1),
+        default=tuned.QUESTIONS,
+        metavar="N",
+        help="pairs that --ask shows [%(default)s]",
+    )
     add(
         "--reconstructions",
         type=at_least(2),
-        default=24,
+        default=tuned.RECONSTRUCTIONS,
         metavar="N",
         help="reconstructions that --ask compares [%(default)s]",
     )

@@ -19,6 +19,8 @@ OMEGAS_MS = {
 # --- features of a state (state) ---
 # Features are clipped to this many standard deviations: what lies beyond is a broken value, not information.
 FEATURE_LIMIT = 8.0
+# Ages are clipped to OLDEST_MS and enter as log(1 + age / AGE_SCALE_MS): fine where they differ by a frame.
+AGE_SCALE_MS, OLDEST_MS = 100.0, 60_000.0
 # Least standard deviation that a feature is divided by, as a share of the largest feature, or of 1 if that is more: one
 # that hardly varied where it was standardized says nothing, and scaling must not turn it into noise.
 MIN_SPREAD = 1e-3

@@ -75,8 +75,8 @@ class StateLayout:
 
     parts: tuple[str, ...] = ("age", "pose", "semantics")
     dim: int = 0
-    age_scale_ms: float = 100.0
-    oldest_ms: float = 60_000.0
+    age_scale_ms: float = tuned.AGE_SCALE_MS
+    oldest_ms: float = tuned.OLDEST_MS
     center: tuple[float, ...] = ()
     spread: tuple[float, ...] = ()
     embedding: str = ""

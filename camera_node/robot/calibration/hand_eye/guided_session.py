@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from camera_node.robot.arm.camera_poses import base_matrix
+from camera_node.robot.arm.settings import ArmConfig
 from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration import calibration_constants as tuned
 from camera_node.robot.calibration.hand_eye.refinement import refine
@@ -29,7 +30,7 @@ from camera_node.robot.calibration.hand_eye.samples import (
     rotation_vectors,
 )
 from camera_node.robot.calibration.targets import WHICH_PRINT, Target, estimate_pose, to_gray
-from camera_node.settings import ArmConfig, source_config
+from camera_node.settings import source_config
 from camera_node.sources.base import Source, pixels
 from camera_node.sources.devices.feed import Image
 from camera_node.sources.registry import open_sources

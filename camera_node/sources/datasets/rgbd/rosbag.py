@@ -19,7 +19,7 @@ from typing import Any
 
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError
-from camera_node.sources.datasets.rgbd.recording import (
+from camera_node.sources.datasets.rgbd.recorded_messages import (
     COMPRESSED,
     COMPRESSED_DEPTH,
     Calibration,

@@ -17,9 +17,10 @@ from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand
 from camera_node.robot.arm.capsules import PAIRS, CapsuleModel, segment_distance
 from camera_node.robot.arm.hand_eye_mount import read_hand_eye
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
+from camera_node.robot.arm.settings import PathConfig
 from camera_node.robot.arm.viewpoint_tour import is_free, plan_tour, reachable, viewpoints
 from camera_node.robot.simulated_controller.controller import HOME_RAD
-from camera_node.settings import PathConfig, source_config
+from camera_node.settings import source_config
 from freshfield.geometry import Pose, se3, so3_exp
 from freshfield.scenario import ScenarioError, load, parse
 from tests.support import refused

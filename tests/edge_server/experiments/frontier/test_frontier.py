@@ -11,7 +11,7 @@ from edge_server.experiments.frontier import from_scratch, frontier_command, upd
 from edge_server.experiments.frontier.output import draw_frontier, draw_updates, recommendation
 from edge_server.experiments.virtual import costs_command
 from edge_server.live.frontier import best_point, read_frontier
-from edge_server.report.style import CYCLE
+from edge_server.matplotlib_figures import CYCLE
 from edge_server.run_records import FrontierPoint
 from edge_server.settings import ComputeConfig
 from tests.edge_server.experiments.sets import SMALL, SMALL_WORDS
