@@ -12,14 +12,15 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, get_args
 
 from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.queue_server import QueueServer
 from channel_emu.model.service_time import ServiceTime
 from channel_emu.model.traffic import PoissonArrivals
 
-DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel")
+Discipline = Literal["drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel"]
+DISCIPLINES: tuple[Discipline, ...] = get_args(Discipline)
 FITTED_DISCIPLINES = tuple(d for d in DISCIPLINES if d != "lcfs-preempt")
 """Disciplines that can be fitted to a recording. lcfs-preempt delivers only fast frames, which biases the
 delays."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from channel_emu.model import faults as fault_modules
 from channel_emu.model.chain import ChainError, check_generator, stationary, two_state_generator
 from channel_emu.model.faults import per_state
-from channel_emu.model.link import DISCIPLINES
+from channel_emu.model.link import Discipline
 from channel_emu.model.notation import section
 from channel_emu.model.presets import preset
 from freshfield.plugins import PluginError
@@ -136,14 +136,12 @@ class ChannelConfig(Settings, frozen=True):
     chain: ChainConfig | None = None
     service: ServiceConfig = field(default_factory=ServiceConfig)
     service_state: Literal["at-start", "modulated"] = "at-start"
-    discipline: str = "drop-new"
+    discipline: Discipline = "drop-new"
     server: ServerConfig = field(default_factory=ServerConfig)
     queue_limit: Annotated[int, within(1, 10**6, "frames waiting (fcfs) or in service (parallel)")] = 1024
     faults: Annotated[dict[str, Any], about("parameters of the listed faults, by name")] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.discipline not in DISCIPLINES:
-            raise ValueError(f"discipline: expected one of {', '.join(DISCIPLINES)}, got {self.discipline!r}")
         states = 1 if self.chain is None else len(self.chain.names())
         chances = {f"faults.{name}.probability": getattr(p, "probability", None) for name, p in self.faults.items()}
         by_state = {

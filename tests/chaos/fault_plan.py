@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from channel_emu.model.link import DISCIPLINES
 from edge_server.scheduler import parse_policy
 from freshfield.scenario import Scenario, parse, seed_sequence
 from tests.support import small_world
 
 ROLES = ("node", "emulator", "edge")
 POLICIES = ("all", "threshold:120", "wait:80", "freshest-k:2", "round-robin:2", "random", "age-driven", "periodic:300")
-DISCIPLINES = ("drop-new", "newest-waits", "fcfs", "lcfs-preempt", "parallel")
 QUEUE_LIMIT = 4
 SECONDS = 4.5
 # Faults begin within this part of a run and are over by FAULTS_OVER_S, so that the rest shows the recovery.

@@ -19,8 +19,6 @@ from typing import Any, Literal
 
 from edge_server.scheduler.learned import learning_constants as tuned
 
-TERMS = ("psnr", "ssim", "distance", "age", "views")
-
 
 @dataclass(frozen=True)
 class RewardTerms:
@@ -62,7 +60,7 @@ class Reward:
     views: float = 0.0
 
     def __post_init__(self) -> None:
-        if not all(math.isfinite(getattr(self, term)) for term in TERMS):
+        if not all(math.isfinite(weight) for weight in vars(self).values() if not isinstance(weight, str)):
             raise ValueError(f"reward {self.name}: weights must be finite")
         if self.fidelity not in ("whole", "moving"):
             raise ValueError(f"reward {self.name}: fidelity is whole or moving, not {self.fidelity!r}")

@@ -30,6 +30,7 @@ from typing import Any
 from freshfield.settings import ScenarioError
 
 KINDS = ("policy", "effect", "fault", "field", "selector", "source")
+_OURS = ("camera_node", "channel_emu", "edge_server", "freshfield")
 _FILE = re.compile(r"(?P<where>[^:]+\.py):(?P<name>[A-Za-z_]\w*)(?P<rest>(:.*)?)")
 _MODULE = re.compile(r"(?P<where>[A-Za-z_]\w*(\.\w+)*):(?P<name>[A-Za-z_]\w*)(?P<rest>(:.*)?)")
 
@@ -61,7 +62,8 @@ def find(kind: str, name: str, built_in: Iterable[str]) -> Any:
         module = _imported(kind, where, lambda: load(where))
         found = getattr(module, match["name"], None)
         if not isinstance(found, type):
-            there = [each for each, value in vars(module).items() if isinstance(value, type)]
+            classes = {each: value for each, value in vars(module).items() if isinstance(value, type)}
+            there = [each for each, value in classes.items() if value.__module__.partition(".")[0] not in _OURS]
             raise PluginError(f"{kind} {name}: no class {match['name']} in it; there are: {', '.join(there) or 'none'}")
         return found
     entries = {entry.name: entry for entry in entry_points(group=f"freshfield.{kind}")}
