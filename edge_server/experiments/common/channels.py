@@ -22,6 +22,8 @@ def read_channel(text: str) -> tuple[dict[str, Any], str]:
     if path.suffix or path.is_file():
         try:
             found = read_yaml(read_text(path))
+        except FileNotFoundError:
+            raise ScenarioError(f"--channel {text}: there is no such file") from None
         except (OSError, UnicodeDecodeError, UntrustedError) as error:
             raise ScenarioError(f"--channel {text}: {error}") from None
         section = found["channel"] if isinstance(found, dict) and "channel" in found else found

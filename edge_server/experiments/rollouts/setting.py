@@ -150,7 +150,7 @@ def reward_of(name: str, on: str, lpips_folder: Path | None, network: str = "ale
     if not missing:
         return reward, None
     # Nothing can be learned from rewards that are never complete.
-    return dataclasses.replace(reward, distance=0.0), f"the reward has no term of distance: {missing}"
+    return dataclasses.replace(reward, distance=0.0), f"the reward has no term of LPIPS: {missing}"
 
 
 def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:

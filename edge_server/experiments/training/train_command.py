@@ -50,7 +50,7 @@ An episode is --decisions decisions at random instants. At each, --samples actio
 of the same field, so that they can be compared: a field that knows the scene, or an empty one (--scratch, as in
 the thesis, whose algorithms update after each decision: --decisions 1 --batch 1 --samples 1). In a synthetic
 scene each episode has its own motion. Images are small (--size) and the field is a small splat, so that there
-are many decisions. Without weights of LPIPS, or where edge.lpips is none, the reward has no term of distance.
+are many decisions. Without weights of LPIPS, or where edge.lpips is none, the reward has no term of LPIPS.
 
 OUT/policy.npz is the learned policy, OUT/actor.npz the part of it that decides, OUT/training.csv and .png the
 learning curve with each term of the reward. edge-server compare says what it shows, on seeds it was not trained

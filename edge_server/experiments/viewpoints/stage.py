@@ -23,7 +23,12 @@ from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_poses, half_hemisphere
 from edge_server.viewpoints.policy import Embed
-from edge_server.viewpoints.viewpoint_constants import HELD_OUT_VIEWPOINTS, NEAR_OF_RADIUS, STAGE_EMBEDDING_DIM
+from edge_server.viewpoints.viewpoint_constants import (
+    HELD_OUT_VIEWPOINTS,
+    NEAR_OF_RADIUS,
+    PLAN_CANDIDATES,
+    STAGE_EMBEDDING_DIM,
+)
 from freshfield.scenario import Scenario, load
 
 _BETWEEN = 0.25  # offset of ``half_hemisphere``
@@ -70,7 +75,7 @@ class Stage:
         return score_views(made, self.held_out, scorer)[0]
 
 
-def open_stage(name: str, count: int = 100, size: int | None = None, data: Path | None = None) -> Stage:
+def open_stage(name: str, count: int = PLAN_CANDIDATES, size: int | None = None, data: Path | None = None) -> Stage:
     """Open the stage of a scenario: a file or the name of a shipped one.
 
     A synthetic world has ``count`` candidates on a half-hemisphere round its object, at the distance of the
