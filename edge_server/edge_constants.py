@@ -19,6 +19,14 @@ MOST_CARRIED = 4
 LONG_WORK_S = 10.0  # a stage that takes longer is announced in a pipe, too: nobody wonders about less
 REDRAWN_S = 1.0  # between two drawings of a command's progress: the seconds that it tells change no faster
 
+# --- figures of reports, studies and trainings (matplotlib_figures) ---
+FIGURE_WIDTH_INCH, FIGURE_DPI = 8.4, 110  # width and resolution of every figure
+FIGURE_COLORS = 64  # in a file with curves alone: a quarter of the bytes, without a visible difference
+# Colors in a file with pictures, and rounds of k-means that keep their rare colors: a third of the bytes.
+PICTURE_COLORS, PICTURE_MEANS = 256, 3
+# A legend of up to so many entries stands in a row above the axes; height of that row, in points.
+LEGEND_IN_A_ROW, LEGEND_ROW_PT = 4, 20.0
+
 # --- networks in ONNX (embed.embedder, embed.depth_network) ---
 # Images per run if the model takes any number: larger batches exceed the caches and take longer per image.
 EMBEDDING_BATCH = 4

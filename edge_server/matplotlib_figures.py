@@ -17,7 +17,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from PIL import Image
 
-from edge_server.report import report_constants as tuned
+from edge_server import edge_constants as tuned
 
 # Okabe and Ito's palette, ordered so that neighbors differ in lightness too.
 BLUE, VERMILION, GREEN = "#0072B2", "#D55E00", "#009E73"

@@ -24,13 +24,7 @@ LATE_S = 1.0
 CUT_OFF_NS = 10 * 10**9
 MOST_CONTRADICTIONS = 20  # that are listed, enough to see what went wrong; the count says how often
 
-# --- figures (style, figures, explain_command) ---
-FIGURE_WIDTH_INCH, FIGURE_DPI = 8.4, 110  # width and resolution of every figure
-FIGURE_COLORS = 64  # in a file with curves alone: a quarter of the bytes, without a visible difference
-# Colors in a file with pictures, and rounds of k-means that keep their rare colors: a third of the bytes.
-PICTURE_COLORS, PICTURE_MEANS = 256, 3
-# A legend of up to so many entries stands in a row above the axes; height of that row, in points.
-LEGEND_IN_A_ROW, LEGEND_ROW_PT = 4, 20.0
+# --- figures (figures, explain_command) ---
 # Factor by which errors are brightened, also on the page: one of 10 % of the range is plain to see.
 ERROR_GAIN = 4.0
 MOST_LABELS = 24  # most cameras that have a label of their own
