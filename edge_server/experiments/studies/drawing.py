@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -65,7 +66,7 @@ def curves(
                     for policy, style in ((NO_DELAY, ":"), (USE_ALL, "--")):
                         if (level := _level(table, metric, policy, here)) is not None:
                             at.axhline(level, color=GRAY, linestyle=style, linewidth=1.2, label=policy)
-                    text = METRICS[metric].label.replace(", ", ",\n")
+                    text = textwrap.fill(METRICS[metric].label, 20)
                     label_lines(at, text, axis if metric == measured[-1] else None)
                 axes[0, 0].set_title(", ".join(map(str, values)))
 

@@ -93,7 +93,9 @@ OMEGA = Study(
     ),
     ("scene", "channel"),
     (
-        curves("omega", "omega_ms", "omega (ms)", (*PLATEAU_NEAR, *FRESHNESS), "policy", ("scene", "channel")),
+        curves(
+            "omega", "omega_ms", "omega (ms)", (*PLATEAU_NEAR, *FRESHNESS, "aaoi_ms"), "policy", ("scene", "channel")
+        ),
         *(
             instants(f"omega-{policy}", ("room", "kitchen"), policy, SHOWN, {"preset": "ch6-high"}, every_ms=2400.0)
             for policy in ("threshold", "wait")
