@@ -5,12 +5,10 @@ import asyncio
 import importlib
 import socket
 import struct
-import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import pytest
@@ -106,21 +104,3 @@ def axes_drawn(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     kept, save = [], figure.savefig
     monkeypatch.setattr(figure, "savefig", lambda drawn, *a, **k: kept.append(drawn.axes) or save(drawn, *a, **k))
     return kept
-
-
-def lines_run(call: Callable[[], Any]) -> int:
-    """Lines of Python that ``call`` runs: the same on every machine."""
-    count = 0
-
-    def trace(_frame: FrameType, event: str, _arg: Any) -> Any:
-        nonlocal count
-        count += event == "line"
-        return trace
-
-    before = sys.gettrace()
-    sys.settrace(trace)
-    try:
-        call()
-    finally:
-        sys.settrace(before)
-    return count

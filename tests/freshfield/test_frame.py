@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from freshfield import limits, payload
 from freshfield.depth import DepthImage
-from freshfield.frame import Frame, FrameRejected, checksum, counted_ids, from_request, parse, to_request, valid_id
+from freshfield.frame import Frame, FrameRejected, checksum, from_request, parse, to_request, valid_id
 from freshfield.geometry import Pinhole, Pose, quaternion_normalize
 from freshfield.v1 import frames_pb2 as pb
-from tests.support import lines_run, refused
+from tests.support import refused, work_ms
 
 IMAGE = np.arange(16 * 12 * 3, dtype=np.uint8).reshape(12, 16, 3)
 DATA = {codec: payload.encode(IMAGE, codec) for codec in payload.CODECS}
@@ -212,20 +212,11 @@ RAW = to_request(frame()).SerializeToString()
 
 
 def test_four_million_fields_are_read_at_once():
-    """At some 15 ns a field; Python's share does not grow with their number."""
+    """At some 15 ns a field, those of protobuf's parser: Python's share does not grow with their number."""
     raw = RAW + b"\x0a\0" * (4 * 2**20 - 1000)
     assert api_implementation.Type() == "upb"
     assert parse(raw).header.camera_id == "cam07"
-    assert lines_run(lambda: parse(raw)) == lines_run(lambda: parse(RAW)) < 10
-
-
-def test_refusals_of_strangers_are_counted_together():
-    def ids(camera, session):
-        return counted_ids(pb.FrameHeader(camera_id=camera, session_id=session), ["cam07"])
-
-    assert ids("cam07", "s1") == ("cam07", "s1")
-    assert ids("cam07", "a\tb") == ("cam07", "?")
-    assert ids("cam08", "s1") == ids("made-up", "s2") == ("?", "?")
+    assert work_ms(lambda: parse(raw)) < 1.5 * work_ms(lambda: pb.PushRequest.FromString(raw))
 
 
 # Part of the contract, since peers of other versions keep within them. Written out: tests of each bound import it.

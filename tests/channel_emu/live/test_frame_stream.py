@@ -33,7 +33,7 @@ from freshfield.v1 import channel_pb2, channel_pb2_grpc, clock_pb2, clock_pb2_gr
 from freshfield.v1 import frames_pb2 as pb
 from tests.channel_emu.live.emulator import CAMERAS, answer_to, emulate, make, offer
 from tests.edge_server.frames import frame
-from tests.freshfield.serving import status
+from tests.freshfield.serving import serving, status
 from tests.integration.peer import Peer, silence
 from tests.support import free_port, until
 
@@ -327,20 +327,16 @@ async def test_answers_that_are_none_end_the_stream_and_not_the_emulator(tmp_pat
             await context.write(answer)
         await asyncio.sleep(60)
 
-    server = Transport().aio_server()
     push = grpc.method_handlers_generic_handler(
         "freshfield.v1.FrameStreamService", {"Push": grpc.stream_stream_rpc_method_handler(nonsense)}
     )
-    server.add_generic_rpc_handlers((push,))
-    address = f"127.0.0.1:{Transport().bind(server, '127.0.0.1:0')}"
-    await server.start()
-    proxy, (flow,) = make(tmp_path, address, {})
-    await proxy.start()
-    offer(flow, 0)
-    await until(lambda: flow.connections >= 2)
-    assert flow.broken == 1 and not proxy._failure.done()
-    await proxy.stop()
-    await server.stop(None)
+    async with serving(Transport(), push) as port:
+        proxy, (flow,) = make(tmp_path, f"localhost:{port}", {})
+        await proxy.start()
+        offer(flow, 0)
+        await until(lambda: flow.connections >= 2)
+        assert flow.broken == 1 and not proxy._failure.done()
+        await proxy.stop()
 
 
 async def test_an_edge_that_never_answers_costs_frames_and_no_memory(tmp_path):

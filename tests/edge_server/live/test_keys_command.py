@@ -1,19 +1,19 @@
 """The development authority: what it makes lets every process do its own part, and no more."""
 
-import argparse
 import asyncio
 import stat
 
 import grpc
 import grpc.aio
 import pytest
-from grpc_health.v1 import health, health_pb2_grpc
 
 from edge_server.cli import main
 from edge_server.live.keys_command import make_keys
-from freshfield.transport import Transport, TransportError, add_arguments, from_arguments
+from freshfield.transport import Transport, TransportError
 from tests.deploy.test_up import healthy
+from tests.freshfield.serving import serving
 from tests.freshfield.test_access import Every
+from tests.freshfield.test_transport import parsed
 from tests.support import refusal, refused
 
 
@@ -25,10 +25,8 @@ def keys(tmp_path_factory):
 
 
 def of(folder, *more: str) -> Transport:
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
     files = ["--tls-cert", "cert.pem", "--tls-key", "key.pem", "--tls-ca", "ca.pem", *more]
-    return from_arguments(parser.parse_args([w if w[0] == "-" else str(folder / w) for w in files]))
+    return parsed(*(w if w[0] == "-" else str(folder / w) for w in files))
 
 
 async def test_a_certificate_lets_its_process_do_its_own_part(keys):
@@ -60,14 +58,9 @@ async def test_a_certificate_lets_its_process_do_its_own_part(keys):
 
 
 async def test_the_health_check_passes_mutual_tls(keys):
-    emulator = of(keys / "emulator")
-    server = emulator.aio_server()
-    health_pb2_grpc.add_HealthServicer_to_server(health.aio.HealthServicer(), server)
-    serving = ("--serving", f"127.0.0.1:{emulator.bind(server, '127.0.0.1:0')}")
-    await server.start()
     files = [f"--tls-{part}={keys / 'emulator' / part}.pem" for part in ("cert", "key", "ca")]
-    found = [await asyncio.to_thread(healthy, *serving, *more) for more in (files, [])]
-    await server.stop(None)
+    async with serving(of(keys / "emulator"), health=True) as port:
+        found = [await asyncio.to_thread(healthy, "--serving", f"localhost:{port}", *more) for more in (files, [])]
     assert found == [True, False]
 
 

@@ -14,17 +14,6 @@ from freshfield.geometry import Pinhole, Pose
 from tests.edge_server.frames import damaged_frame, frame
 
 
-def test_a_frame_is_decoded_once_and_carries_the_edges_time():
-    decoder = ViewDecoder()
-    item = frame(generated_ns=5, clock_offset_ns=7, received_ns=20)
-    (first,) = decoder.views([item])
-    (second,) = decoder.views([item])
-    assert first is second
-    assert first.generated_ns == 12
-    assert first.image.shape == (24, 32, 3)
-    assert np.allclose(first.camera_to_world, item.pose.matrix())
-
-
 def test_a_large_image_is_decoded_smaller_and_whole_when_asked_for():
     item = frame()  # 32 x 24
     for most, size in ((768, (24, 32)), (767, (12, 16)), (1, (3, 4))):

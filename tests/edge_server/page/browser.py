@@ -38,17 +38,13 @@ FLAGS = (
     "--remote-debugging-port=0 --remote-allow-origins=*"
 )
 
-# The visible element with the least text that contains what is looked for: a button, not the page.
+# The middle of the button that shows what is looked for.
 _FIND = """
 (wanted) => {
-  const seen = (e) => { const r = e.getBoundingClientRect(); return r.width > 0 && r.height > 0; };
-  const hits = [...document.querySelectorAll('body *')].filter(
-    (e) => e.innerText && e.innerText.includes(wanted) && seen(e));
-  if (!hits.length) return null;
-  const best = hits.reduce((a, b) => (b.innerText.length <= a.innerText.length ? b : a));
-  best.scrollIntoView({block: 'center'});
-  const r = best.getBoundingClientRect();
-  return [r.x + r.width / 2, r.y + r.height / 2];
+  const found = [...document.querySelectorAll('button')].find((e) => e.innerText.includes(wanted));
+  found?.scrollIntoView({block: 'center'});
+  const r = found?.getBoundingClientRect();
+  return r?.width ? [r.x + r.width / 2, r.y + r.height / 2] : null;
 }
 """
 
@@ -155,14 +151,14 @@ class Browser(contextlib.AbstractContextManager):
         """All text that the page shows."""
         return self.evaluate("document.body ? document.body.innerText : ''") or ""
 
-    def wait_for(self, wanted: Callable[[], Any], what: str, timeout_s: float | None = None) -> Any:
+    def wait_for(self, wanted: Callable[[], Any], what: str) -> Any:
         """First true value of ``wanted``; ``what`` names it in the error."""
         said = f"{what} did not happen; the page shows:\n"
-        return wait_until(wanted, lambda: said + self.text(), timeout_s or self.timeout_s)
+        return wait_until(wanted, lambda: said + self.text(), self.timeout_s)
 
-    def wait_for_text(self, wanted: str, timeout_s: float | None = None) -> str:
+    def wait_for_text(self, wanted: str) -> str:
         """The page's text, once ``wanted`` is part of it."""
-        return self.wait_for(lambda: wanted in (text := self.text()) and text, f"the text {wanted!r}", timeout_s)
+        return self.wait_for(lambda: wanted in (text := self.text()) and text, f"the text {wanted!r}")
 
     def click(self, x: float, y: float) -> None:
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=float(x), y=float(y))
@@ -170,7 +166,7 @@ class Browser(contextlib.AbstractContextManager):
             self.call("Input.dispatchMouseEvent", type=kind, x=float(x), y=float(y), button="left", clickCount=1)
 
     def click_text(self, wanted: str) -> None:
-        """Click in the middle of the smallest visible thing that shows ``wanted``."""
+        """Click in the middle of the button that shows ``wanted``."""
         at = self.wait_for(lambda: self.evaluate(f"({_FIND})({json.dumps(wanted)})"), f"a {wanted!r}")
         self.click(*at)
 

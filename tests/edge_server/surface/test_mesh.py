@@ -27,22 +27,17 @@ RNG = np.random.default_rng(11)
 
 
 @pytest.mark.parametrize("camera", [balls.LENS, balls.DISTORTED_LENS, balls.TILTED_LENS])
-def test_the_kernel_fuses_as_the_equations_say(camera):
+def test_the_kernel_fuses_as_the_equations_say_whatever_the_number_of_threads(camera):
     maps = balls.ball_maps(5, camera)
-    volume = fuse_maps(COARSE, maps)
+    volume, alike = (fuse_maps(COARSE, maps, pool=Pool(threads, nice=0)) for threads in (1, 3))
+    for one, other in zip(volume.blocks, alike.blocks):
+        np.testing.assert_array_equal(one, other)
     rng = np.random.default_rng(0)
     number, cell = rng.integers(0, len(volume.blocks.place), 400), rng.integers(0, SIDE**3, 400)
     distance, weight = balls.plain_fuse(COARSE, maps, balls.voxel_points(volume)[number, cell])
     assert (weight > 0).mean() > 0.3
     np.testing.assert_allclose(volume.blocks.weight[number, cell], weight, atol=2e-5)
     np.testing.assert_allclose(volume.blocks.distance[number, cell], distance, atol=1e-6)
-
-
-def test_the_number_of_threads_changes_no_bit_of_a_volume():
-    maps = balls.ball_maps(6)
-    one, three = (fuse_maps(COARSE, maps, pool=pool) for pool in (Pool(1, nice=0), Pool(3, nice=0)))
-    for a, b in zip(one.blocks, three.blocks):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_too_fine_a_grid_says_what_would_do(monkeypatch):

@@ -45,15 +45,6 @@ def test_series_keeps_the_order_of_publication_and_waits_for_scores(tmp_path):
     assert [(s["number"], s["psnr_db"]) for s in lines(tmp_path / "series.jsonl")] == [(0, 20.0), (1, 21.0), (2, None)]
 
 
-def test_a_score_that_never_comes_holds_nothing_up(tmp_path):
-    journal = Journal(tmp_path, dict)
-    for i in range(100):
-        journal.published(publication(i))
-    assert len(lines(tmp_path / "series.jsonl")) == 68
-    journal.close()
-    assert len(lines(tmp_path / "series.jsonl")) == 100
-
-
 def test_a_full_disk_costs_lines_not_the_edge(tmp_path, caplog):
     journal = Journal(tmp_path, lambda: {"filling": "x" * 1000, "lines_lost": journal.lines_lost})
     with no_file_longer_than(0):
