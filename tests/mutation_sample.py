@@ -39,6 +39,7 @@ from cosmic_ray.plugins import get_operator
 
 from edge_server.experiments.engine.engine import ResultStore
 from edge_server.fields.common.kernels.jit import cache_folder
+from freshfield.files import write_json
 
 ROOT = Path(__file__).resolve().parent.parent
 # Folders of sources, and where their tests are.
@@ -259,6 +260,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     add = parser.add_argument
     add("--seed", type=int, default=1, help="seed of the sample [%(default)s]")
     add("--count", type=int, default=200, help="number of edits [%(default)s]")
+    add("--json", type=Path, metavar="FILE", help="file to write the counts and the survivors to")
     add("--out", type=Path, default="runs/mutants.jsonl", metavar="FILE", help="where results are kept [%(default)s]")
     args = parser.parse_args(argv)
     store, copy, survivors, broken = ResultStore(args.out), args.out.with_suffix("").resolve(), [], []
@@ -272,6 +274,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         survivors += [edit.text()] * (store.results[key] is None)
     print("\n  ".join(["\nsurvivors:", *survivors]))
     caught = args.count - len(survivors)
+    if args.json is not None:
+        write_json(args.json, {"seed": args.seed, "drawn": args.count, "caught": caught, "survivors": survivors}, 1)
     low, high = scipy.stats.binomtest(caught, args.count).proportion_ci(method="wilson")
     print(f"{caught} of {args.count} caught: {caught / args.count:.1%} [{low:.1%}, {high:.1%}]")  # 95 %
     return int(bool(survivors))

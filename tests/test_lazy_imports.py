@@ -5,8 +5,6 @@ import sys
 
 import pytest
 
-from camera_node.synthetic.effects import NAMES
-
 PROGRAMS = {
     "pytest": "import channel_emu.pytest_plugin",
     "edge": """
@@ -26,11 +24,6 @@ from camera_node.settings import source_config
 from freshfield.scenario import load
 (camera,) = build_cameras(load("tile"), source_config(load("tile")), ["cam00"])
 camera.capture(0)
-""",
-    "one effect": """
-import numpy as np
-from camera_node.synthetic.effects import load_effects
-load_effects({"depth_sensor": {}}, {"depth_sensor": np.random.default_rng(0)}.__getitem__)
 """,
     "few cameras": """
 import edge_server.fields.splat.layers.layered_field
@@ -58,7 +51,6 @@ UNASKED = {
     "node without an arm": "camera_node.pose camera_node.robot.flange_camera camera_node.sources.devices.live rtde "
     "depthai camera_node.synthetic.effects. camera_node.synthetic.depth camera_node.synthetic.scenes.room "
     "camera_node.synthetic.person torch numba edge_server channel_emu scipy matplotlib",
-    "one effect": " ".join(f"camera_node.synthetic.effects.{name}" for name in NAMES if name != "depth_sensor"),
     "few cameras": "edge_server.fields.splat.layers.depth.network_depth edge_server.embed onnx",
     "warm-up": "grpc zstandard google torch",  # ``make`` compiles while it installs them
     "channel": "channel_emu.model.faults. channel_emu.live torch numba camera_node edge_server freshfield_up",

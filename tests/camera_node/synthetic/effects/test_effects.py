@@ -1,6 +1,8 @@
 """Every effect keeps the contract; its errors are as large as asked for, and each camera's own."""
 
 import pkgutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -15,6 +17,44 @@ from camera_node.synthetic.effects.pose_noise import PoseNoise
 from camera_node.synthetic.effects.sensor_noise import SensorNoise
 from freshfield.geometry import Pinhole, Pose, look_at
 from freshfield_up import check_plugin
+
+STREAM = """
+import sys, tracemalloc
+from pathlib import Path
+import numpy as np
+from camera_node.synthetic import effects as fx, make_scene
+from camera_node.synthetic.source import WorldSource
+
+listed, folder = {listed!r}, Path({folder!r})
+streams = []
+scene = make_scene("tile", dict(width=16, height=16, supersample=1))
+tracemalloc.start(4)
+calls = 0
+def count(frame, event, argument):
+    global calls
+    calls += event == "call" and Path(frame.f_code.co_filename).parent.name == "effects" \\
+        and not frame.f_code.co_filename.endswith("__init__.py")
+effects = fx.load_effects(listed, lambda n: streams.append(n) or np.random.default_rng(0))
+camera = WorldSource("cam01", scene, "cam01", 15, effects=effects, folder=folder)
+sys.setprofile(count)
+for k in range(12):
+    camera.depth(k, camera.read(camera.content(k)))
+    effects.node_ns(k)
+sys.setprofile(None)
+held = tracemalloc.take_snapshot().filter_traces(
+    [tracemalloc.Filter(True, "*synthetic/effects/[a-z]*", all_frames=True)]).statistics("filename")
+assert listed or "camera_node.synthetic.depth" not in sys.modules
+modules = sorted(m.rsplit(".", 1)[1] for m in sys.modules if m.startswith("camera_node.synthetic.effects."))
+print(modules, streams, calls > 0, sum(s.size for s in held) > 0)
+"""
+
+
+def test_what_is_listed_is_all_that_is_imported_called_and_allocated(tmp_path):
+    used = "['depth_sensor'] ['depth_sensor'] True True\n"
+    for listed, printed in (({}, "[] [] False False\n"), ({"depth_sensor": {}}, used)):
+        code = STREAM.format(listed=listed, folder=str(tmp_path))
+        out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        assert (out.returncode, out.stdout) == (0, printed), out.stderr
 
 
 def test_every_file_is_registered_and_keeps_its_contract():
