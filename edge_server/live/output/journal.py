@@ -32,7 +32,8 @@ log = logging.getLogger(__name__)
 class Journal:
     """Writes the files of one run. Thread-safe.
 
-    out: the run's folder. Lines are appended to those of an earlier process: an edge may be restarted.
+    out: the run's folder. Lines are appended to those of an earlier process: an edge may be restarted. One that says
+        nothing, at 0 s, then goes before them in each file.
     status: gives the contents of edge.json.
     A full disk costs lines (counted in ``lines_lost``) and statuses, and never ends the edge.
     """
@@ -44,6 +45,9 @@ class Journal:
         self._open: OrderedDict[int, Publication] = OrderedDict()
         self._lock = threading.Lock()
         self._files = {name: Lines(out / f"{name}.jsonl") for name in ("series", "shown", "ages")}
+        if (out / "ages.jsonl").stat().st_size:  # of an earlier process, which may have published nothing
+            for file in self._files.values():
+                file.write('{"t_s": 0.0, "age_ms": {}}')
         self._last_s: float | None = None  # instant of the last publication
         self._usual_s: float | None = None  # usual time from one publication to the next
         self._without_line = 0  # publications since the last line of the series
