@@ -221,7 +221,7 @@ def test_an_earlier_run_is_replaced_and_a_link_in_it_is_not_followed(tmp_path):
     (precious / "photo").write_text("keep")
     out = tmp_path / "out"
     prepare(out, {"run": 1}).close()
-    for name in ("ledger-edge-edge-1.tsv", "frontier.json", ".edge.json.4f.part"):
+    for name in ("ledger-edge-edge-1.tsv", "frontier.json", ".edge.json.4f.part", "decision-000012.png"):
         (out / name).write_text("old")
     (out / "decisions").symlink_to(precious)
     prepare(out, {"run": 2}).close()
