@@ -113,8 +113,12 @@ class EdgeServer:
         # What moves, in words: nothing yet, or what the earlier run knew.
         self._moving = str(about.get("moving") or ("a camera" if cameras_move(scenario) else ""))
         config_if_moving = msgspec.structs.replace(read_config(scenario, moving=True), policy=config.policy)
-        self.config = config = config_if_moving if about.get("moving") else config
-        self.frontier = open_frontier(scenario, config)
+        self.config, first = (config_if_moving if about.get("moving") else config), config
+        config = self.config
+        try:
+            self.frontier = open_frontier(scenario, config)
+        except ValueError:  # see ``_camera_moves``
+            self.frontier = open_frontier(scenario, first)
         field = self._make_field(config)
         if state is not None:
             field.load_state(state)

@@ -10,6 +10,7 @@ import threading
 import time
 import urllib.request
 from contextlib import suppress
+from importlib import resources
 from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
@@ -196,7 +197,10 @@ def test_a_camera_that_moves_begins_the_field_anew_as_a_scan_and_a_resumed_run_k
     small = {"gaussians": 300, "start": 200, "seed_cells": 12}
     for kind in ({"layers": True}, LIVE_OPTIONS):  # compiling may take longer than the test waits for anything
         make_field("splat", {**kind, **small}).warm_up()
-    made = tiny_scenario(tmp_path, field="splat", field_options=small)
+    known = json.loads(resources.files("edge_server").joinpath("frontier.json").read_text())["updates"]
+    own = {"updates": [row for row in known if row["options"].get("layers")]}  # knows the first choice only
+    (tmp_path / "own.json").write_text(json.dumps(own))
+    made = tiny_scenario(tmp_path, field="splat", field_options=small, frontier="own.json")
     run = serve(made)
     server = run.server
     said = "splat in layers, updated at arrivals for 100 ms: no camera moves; the scenario sets field, update_ms"
