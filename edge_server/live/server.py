@@ -122,7 +122,6 @@ class EdgeServer:
         field = self._make_field(config)
         if state is not None:
             field.load_state(state)
-        self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)
         lpips, self.lpips_missing = (
             (None, "turned off by the scenario (edge.lpips: none)")
             if config.lpips == "none"
@@ -149,6 +148,7 @@ class EdgeServer:
 
             self.recorder = Recorder(options.record, scenario.name)
             log.info("recording to %s", self.recorder.file)
+        self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)  # once nothing above can fail any more
         self.ingest = Ingest(
             self.clock,
             self.buffer,
@@ -199,12 +199,16 @@ class EdgeServer:
     def run(self) -> None:
         """Serve until stopped, then write everything down. Raises what ended the update loop, if it
         failed; TransportError if a port would be open to others."""
-        self.state.warnings = self._warnings()
-        self.scoring.load()  # before frames come: they would wait for it
         grpc = GrpcThread(
             self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
         )
-        grpc.start()
+        try:
+            self.state.warnings = self._warnings()
+            self.scoring.load()  # before frames come: they would wait for it
+            grpc.start()
+        except BaseException:  # nothing was served, and edge.json stays that of an earlier run
+            self._close_records()
+            raise
         opened: list[OpenPage] = []
         try:
             for name, start in (("page", self.options.open_page), ("Foxglove", self.options.open_foxglove)):
@@ -217,6 +221,7 @@ class EdgeServer:
                 serve_metrics(
                     self.state, self.ingest, self.options.page_host, self.options.metrics_port, self.options.transport
                 )
+            self.journal.begin()
             self.scoring.start()
             self.loop.start()
             self._watch()
@@ -424,11 +429,16 @@ class EdgeServer:
         finally:
             # Whatever failed, the ledger is complete and the status is the last one.
             try:
-                self.ledger.close(self.clock.now_ns())
+                self._close_records()
             finally:
-                if self.recorder is not None:
-                    self.recorder.close()
                 self.journal.close()
+
+    def _close_records(self) -> None:
+        try:
+            self.ledger.close(self.clock.now_ns())
+        finally:
+            if self.recorder is not None:
+                self.recorder.close()
 
 
 def _last_frames(path: Path) -> LastFrames:

@@ -32,8 +32,7 @@ log = logging.getLogger(__name__)
 class Journal:
     """Writes the files of one run. Thread-safe.
 
-    out: the run's folder. Lines are appended to those of an earlier process: an edge may be restarted. One that says
-        nothing, at 0 s, then goes before them in each file.
+    out: the run's folder. Lines are appended to those of an earlier process: an edge may be restarted.
     status: gives the contents of edge.json.
     A full disk costs lines (counted in ``lines_lost``) and statuses, and never ends the edge.
     """
@@ -45,9 +44,6 @@ class Journal:
         self._open: OrderedDict[int, Publication] = OrderedDict()
         self._lock = threading.Lock()
         self._files = {name: Lines(out / f"{name}.jsonl") for name in ("series", "shown", "ages")}
-        if (out / "ages.jsonl").stat().st_size:  # of an earlier process, which may have published nothing
-            for file in self._files.values():
-                file.write('{"t_s": 0.0, "age_ms": {}}')
         self._last_s: float | None = None  # instant of the last publication
         self._usual_s: float | None = None  # usual time from one publication to the next
         self._without_line = 0  # publications since the last line of the series
@@ -57,6 +53,13 @@ class Journal:
     def lines_lost(self) -> int:
         """Number of lines that could not be written so far."""
         return sum(file.lost for file in self._files.values())
+
+    def begin(self) -> None:
+        """Where an earlier process, which may have published nothing, left lines, say in each file that another one
+        begins: by a line that says nothing, at 0 s."""
+        if (self._out / "ages.jsonl").stat().st_size:
+            for file in self._files.values():
+                file.write('{"t_s": 0.0, "age_ms": {}}')
 
     def published(self, publication: Publication) -> None:
         with self._lock:

@@ -192,6 +192,7 @@ def test_rows_are_in_order_of_time_also_across_a_restart(tmp_path):
     assert [row.t_s for row in files.shown][-3:] == [9.9, 10.0, 10.05]
     for published in ([], [publication(0)]):  # the first process waited for cameras, and published nothing
         journal = Journal(tmp_path / "again", dict)
+        journal.begin()
         for i in range(50):
             journal.ages(0.2 + 0.2 * i, {})
         for each in published:
