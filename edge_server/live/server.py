@@ -253,7 +253,7 @@ class EdgeServer:
     def _watch(self) -> None:
         """Write status and ages, and notice if the loop ends."""
         ticks, every = 0, round(tuned.STATUS_PERIOD_S / tuned.AGES_PERIOD_S)
-        saved_ns = self.clock.now_ns()
+        saved_ns, saving = self.clock.now_ns(), None
         while not self._stopping.wait(tuned.AGES_PERIOD_S) and self.loop.alive:
             now_ns = self.clock.now_ns()
             ages = self.buffer.ages_ms(now_ns), self.ingest.depth_ages_ms(now_ns)
@@ -262,9 +262,11 @@ class EdgeServer:
                 self.journal.write_status()
             ticks += 1
             every_s = self.options.checkpoint_s
-            if every_s is not None and now_ns - saved_ns > every_s * 1e9:
+            # None waits behind another: cameras may come after hours, and as many would be written one after the other.
+            due = every_s is not None and now_ns - saved_ns > every_s * 1e9
+            if due and (saving is None or saving.done()):
                 saved_ns = now_ns
-                self.loop.request_checkpoint(self.options.out / "field.npz")
+                saving = self.loop.request_checkpoint(self.options.out / "field.npz")
 
     # --- callbacks -------------------------------------------------------------------------
 

@@ -25,7 +25,7 @@ from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
 from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
-from edge_server.live.live_constants import MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS, STOP_S
+from edge_server.live.live_constants import AGES_PERIOD_S, MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS, STOP_S
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.server import EdgeServer, ServerOptions
 from edge_server.scheduler.learned.actor import Actor
@@ -250,7 +250,12 @@ def test_watchers_are_few_and_a_new_one_always_finds_a_place(serve):
 
 
 def test_snapshots_do_not_fill_the_disk(serve, tmp_path):
-    server = serve().fed().server
+    run = serve(checkpoint_s=0.0)
+    waiting = run.server.loop._checkpoints.qsize
+    until(waiting)
+    time.sleep(3 * AGES_PERIOD_S)
+    assert waiting() == 1, "nobody has sent anything, for hours"
+    server = run.fed().server
     with server._snapshot_lock, pytest.raises(RuntimeError, match="another one is being written"):
         server.state.save_snapshot()
     server.state.save_snapshot()
