@@ -180,7 +180,8 @@ def test_operators_see_and_change_a_running_server(serve):
     assert [c.camera_id for c in status.cameras if c.held_out] == ["cam00"]
     changed = edge.SetPolicy(edge_pb2.SetPolicyRequest(name="threshold", value=77.0))
     assert (changed.name, changed.value) == ("threshold", 77.0)
-    until(lambda: server.state.publications()[-1].omega_ms == 77.0)
+    assert edge.SetPolicy(edge_pb2.SetPolicyRequest(value=78.0)).value == 78.0, "of the policy in force"
+    until(lambda: server.state.publications()[-1].omega_ms == 78.0)
     unknown = edge.SetPolicy.future(edge_pb2.SetPolicyRequest(name="best"))
     assert unknown.code() == grpc.StatusCode.INVALID_ARGUMENT and "freshest-k" in unknown.details()
     assert checkpoint.load(edge.SaveSnapshot(edge_pb2.SaveSnapshotRequest()).path)[0]
