@@ -173,6 +173,7 @@ class EdgeServer:
             self._write_checkpoint,
             lambda what: self.state.note(what),
         )
+        self.loop.without_step = max(0, int(about.get("without_step", 0)))  # of all updates: ``number`` counts on
         self.state = EdgeState(
             scenario=scenario.name,
             policies=self.policies.offered,
@@ -342,6 +343,7 @@ class EdgeServer:
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "updates": self.updater.number,
+            "without_step": self.loop.without_step,
         }
         checkpoint.save(path, self.updater.field.state(), about)
 
