@@ -55,13 +55,14 @@ def age_parts_ms(updates: Sequence[Any], now_s: float) -> dict[str, float]:
     instant meets long gaps more often). Empty for fewer than two updates, or where no network time is known.
 
     updates: in order, each with number, t_s, network_ms, update_ms, aaoi_ms (``UpdateRow``, ``Publication``). Where
-    numbers are left out, publications lie evenly between. now_s: on their clock; nothing is published since the last.
+    numbers are left out, publications lie evenly between; an edge that starts again may repeat some. now_s: on their
+    clock; nothing is published since the last.
     """
     known = [each for u in updates if None not in (each := (u.network_ms, u.update_ms, u.aaoi_ms))]
     if len(updates) < 2 or not known:
         return {}
     gap_ms = 1e3 * np.diff([*(u.t_s for u in updates), now_s])
-    gaps = np.diff([*(u.number for u in updates), updates[-1].number + 1])
+    gaps = np.maximum(np.diff([*(u.number for u in updates), updates[-1].number + 1]), 1)
     network, computing, age = np.mean(known, axis=0)
     parts = {
         "network": network,

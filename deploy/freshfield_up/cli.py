@@ -52,7 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except ImportError as error:
         print(f"freshfield: {error.name} is missing: pip install 'freshfield[edge]'", file=sys.stderr)
         return 2
-    except (ScenarioError, FolderError, MissingCommand) as error:
+    except BrokenPipeError:  # nobody reads the output
+        raise
+    except (ScenarioError, FolderError, MissingCommand, OSError) as error:
         print(f"freshfield: {error}", file=sys.stderr)
         return 2
 

@@ -20,9 +20,9 @@ WRITTEN = (
     *("edge.json", "channel.json", "node-*.json", "frontier.json", "processes.jsonl"),
     *("series.jsonl", "shown.jsonl", "ages.jsonl", "poses.jsonl", "ledger-*.tsv", "log-*.txt", "decisions"),
     *("field.npz", "snapshot-*.npz", "truth.png", "rendered.png", "figure-*.png", "report.json", "report.html"),
-    ".*.part",
+    *("decision-*.png", ".*.part"),
 )
-"""Names, with wildcards, of what the processes of a run write into its folder."""
+"""Names, with wildcards, of what the processes of a run, and ``edge-server explain``, write into its folder."""
 EARLIER = "earlier-run"
 """Subfolder that keeps the replaced run's files until the new run is up, so a mistyped option loses none."""
 

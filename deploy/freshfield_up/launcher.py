@@ -11,12 +11,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from types import FrameType
 
 from freshfield import scenario as scenarios
-from freshfield.files import read_status
+from freshfield.files import Lines, read_status
 from freshfield.machine_load import LoadMeter
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield_up import console, folder, ports
@@ -88,8 +88,9 @@ class Launcher:
             self._say(f"{self.scenario.name}: {cameras}, seed {self.scenario.seed}")
             self._say(f"logs and results: {options.out}")
             try:
-                with suppress(BrokenPipeError):  # nobody reads the lines any more: ends as at Ctrl-C
-                    self._supervise()
+                # Nobody reads the lines any more: ends as at Ctrl-C.
+                with suppress(BrokenPipeError), closing(Lines(options.out / "processes.jsonl")) as samples:
+                    self._supervise(samples)
             finally:
                 self._stop()
             self._report()
@@ -103,8 +104,8 @@ class Launcher:
         """End the run, from any thread; ``run`` returns once the report is written."""
         self._stop_requested.set()
 
-    def _supervise(self) -> None:
-        """Start the processes, then check them every tick until there is a reason to stop."""
+    def _supervise(self, samples: Lines) -> None:
+        """Start the processes, then check them every tick until there is a reason to stop. samples: of their load."""
         # The node renders ahead while the edge loads its libraries. The emulator starts last, so that no
         # frame is sent, and lost, before the edge can take it.
         self.processes.edge.start()
@@ -129,8 +130,7 @@ class Launcher:
             if now_s >= next_sample_s:
                 next_sample_s = now_s + tuned.SAMPLE_EVERY_S
                 running = {child.name: child.pid for child in self.processes.children if child.running and child.pid}
-                with (self.options.out / "processes.jsonl").open("a") as file:
-                    file.write(json.dumps(load.row(now_s - self._began_s, running)) + "\n")
+                samples.write(json.dumps(load.row(now_s - self._began_s, running)))
             if now_s >= next_line_s:
                 next_line_s = now_s + tuned.LINE_EVERY_S
                 line = status_line(self.options.out, len(self.scenario.cameras))
@@ -234,7 +234,11 @@ class Launcher:
             self._say("no report: no process has written about a frame")
             return
         report = Child("report", "the report", [program("edge-server"), "report", str(out)], out / "log-report.txt")
-        report.start()
+        try:
+            report.start()
+        except OSError as error:
+            self._fail(f"no report: {report.log}: {error.strerror}")
+            return
         assert report.process is not None
         try:
             code = report.process.wait(tuned.REPORT_WITHIN_S)

@@ -90,10 +90,10 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
         self, request: edge_pb2.SetPolicyRequest, context: grpc.aio.ServicerContext
     ) -> edge_pb2.SetPolicyResponse:
         controls = self._state.controls
-        if request.name:
+        if request.name or request.HasField("value"):
             value = request.value if request.HasField("value") else None
             try:
-                self._state.set_policy(request.name, value)
+                self._state.set_policy(request.name or controls.policy, value)
             except ValueError as error:
                 # ``abort`` raises an error that a reference cycle keeps, and with it 8 MB of request.
                 context.set_code(grpc.StatusCode.INVALID_ARGUMENT)

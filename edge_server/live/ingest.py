@@ -40,7 +40,7 @@ class _Session:
     sequence: int = -1
     generated_ns: int = -(2**63)
     began_ns: int = 0
-    """Capture time of its first admitted frame, on the edge's clock."""
+    """Capture time of its first frame that this process admitted, on the edge's clock; 0: none yet."""
     newest_ns: int = 0
     """Capture time of its last admitted frame, on the edge's clock."""
 
@@ -130,9 +130,8 @@ class FrameAdmission:
             raise FrameRejected("too_old", f"captured {-ahead / 6e10:.0f} minutes ago: a wrong clock?")
         # Only an admitted frame changes the session: a refused one does not affect the next.
         session.sequence, session.generated_ns = frame.sequence, frame.generated_ns
-        if frame.session not in sessions:
-            session.began_ns = frame.generated_edge_ns
-            sessions[frame.session] = session
+        sessions[frame.session] = session
+        session.began_ns = session.began_ns or frame.generated_edge_ns
         session.newest_ns = frame.generated_edge_ns
         self._look_for_two_nodes(frame, sessions)
         sessions.move_to_end(frame.session)

@@ -120,6 +120,7 @@ class UpdateLoop:
             self._paused = self._controls.paused
             self._on_event(f"an operator {'paused updates' if self._paused else 'resumed'}")
         if self._paused:
+            self._updater.buffer.keep_every_frame(False)  # what comes meanwhile is not left out for lack of time
             self._on_status("paused")
             self._stop.wait(tuned.LONGEST_SLEEP_S)
             return

@@ -113,12 +113,15 @@ class EdgeServer:
         # What moves, in words: nothing yet, or what the earlier run knew.
         self._moving = str(about.get("moving") or ("a camera" if cameras_move(scenario) else ""))
         config_if_moving = msgspec.structs.replace(read_config(scenario, moving=True), policy=config.policy)
-        self.config = config = config_if_moving if about.get("moving") else config
-        self.frontier = open_frontier(scenario, config)
+        self.config, first = (config_if_moving if about.get("moving") else config), config
+        config = self.config
+        try:
+            self.frontier = open_frontier(scenario, config)
+        except ValueError:  # see ``_camera_moves``
+            self.frontier = open_frontier(scenario, first)
         field = self._make_field(config)
         if state is not None:
             field.load_state(state)
-        self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)
         lpips, self.lpips_missing = (
             (None, "turned off by the scenario (edge.lpips: none)")
             if config.lpips == "none"
@@ -145,6 +148,7 @@ class EdgeServer:
 
             self.recorder = Recorder(options.record, scenario.name)
             log.info("recording to %s", self.recorder.file)
+        self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)  # once nothing above can fail any more
         self.ingest = Ingest(
             self.clock,
             self.buffer,
@@ -169,6 +173,7 @@ class EdgeServer:
             self._write_checkpoint,
             lambda what: self.state.note(what),
         )
+        self.loop.without_step = max(0, int(about.get("without_step", 0)))  # of all updates: ``number`` counts on
         self.state = EdgeState(
             scenario=scenario.name,
             policies=self.policies.offered,
@@ -195,12 +200,16 @@ class EdgeServer:
     def run(self) -> None:
         """Serve until stopped, then write everything down. Raises what ended the update loop, if it
         failed; TransportError if a port would be open to others."""
-        self.state.warnings = self._warnings()
-        self.scoring.load()  # before frames come: they would wait for it
         grpc = GrpcThread(
             self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
         )
-        grpc.start()
+        try:
+            self.state.warnings = self._warnings()
+            self.scoring.load()  # before frames come: they would wait for it
+            grpc.start()
+        except BaseException:  # nothing was served, and edge.json stays that of an earlier run
+            self._close_records()
+            raise
         opened: list[OpenPage] = []
         try:
             for name, start in (("page", self.options.open_page), ("Foxglove", self.options.open_foxglove)):
@@ -213,6 +222,7 @@ class EdgeServer:
                 serve_metrics(
                     self.state, self.ingest, self.options.page_host, self.options.metrics_port, self.options.transport
                 )
+            self.journal.begin()
             self.scoring.start()
             self.loop.start()
             self._watch()
@@ -244,7 +254,7 @@ class EdgeServer:
     def _watch(self) -> None:
         """Write status and ages, and notice if the loop ends."""
         ticks, every = 0, round(tuned.STATUS_PERIOD_S / tuned.AGES_PERIOD_S)
-        saved_ns = self.clock.now_ns()
+        saved_ns, saving = self.clock.now_ns(), None
         while not self._stopping.wait(tuned.AGES_PERIOD_S) and self.loop.alive:
             now_ns = self.clock.now_ns()
             ages = self.buffer.ages_ms(now_ns), self.ingest.depth_ages_ms(now_ns)
@@ -253,9 +263,11 @@ class EdgeServer:
                 self.journal.write_status()
             ticks += 1
             every_s = self.options.checkpoint_s
-            if every_s is not None and now_ns - saved_ns > every_s * 1e9:
+            # None waits behind another: cameras may come after hours, and as many would be written one after the other.
+            due = every_s is not None and now_ns - saved_ns > every_s * 1e9
+            if due and (saving is None or saving.done()):
                 saved_ns = now_ns
-                self.loop.request_checkpoint(self.options.out / "field.npz")
+                saving = self.loop.request_checkpoint(self.options.out / "field.npz")
 
     # --- callbacks -------------------------------------------------------------------------
 
@@ -331,6 +343,7 @@ class EdgeServer:
             "scenario": self.scenario.name,
             "seed": self.scenario.seed,
             "updates": self.updater.number,
+            "without_step": self.loop.without_step,
         }
         checkpoint.save(path, self.updater.field.state(), about)
 
@@ -420,11 +433,16 @@ class EdgeServer:
         finally:
             # Whatever failed, the ledger is complete and the status is the last one.
             try:
-                self.ledger.close(self.clock.now_ns())
+                self._close_records()
             finally:
-                if self.recorder is not None:
-                    self.recorder.close()
                 self.journal.close()
+
+    def _close_records(self) -> None:
+        try:
+            self.ledger.close(self.clock.now_ns())
+        finally:
+            if self.recorder is not None:
+                self.recorder.close()
 
 
 def _last_frames(path: Path) -> LastFrames:

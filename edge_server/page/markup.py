@@ -114,7 +114,7 @@ def decision_words(last: Publication, cameras: Sequence[CameraView], policy: str
     if last.refused:
         words += f"; refuses {', '.join(last.refused)}, which contradict the others"
     # Room for two lines, so that what is below stays where it is.
-    return str(_panel.note(f"Update {last.number + 1} {words}.", lines=2))
+    return str(_panel.note(f"Update {last.number} {words}.", lines=2))
 
 
 def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out: bool) -> str:

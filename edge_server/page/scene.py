@@ -169,7 +169,8 @@ class Scene:
         complete = len(poses) == len(cameras) or now - self._seen_at > tuned.QUIET_S
         box = getattr(self._state.renderer, "box", None)
         known = (len(poses), box is not None)
-        if known > self._placed_for and complete and now - self._first_seen < tuned.SETTLE_S:
+        early = self._viewpoint is None or now - self._first_seen < tuned.SETTLE_S
+        if known > self._placed_for and complete and early:
             self._placed_for = known
             self._viewpoint = initial_viewpoint(np.stack(poses), None if box is None else box.center_m)
             start, view = self._server.initial_camera, self._viewpoint
@@ -179,6 +180,8 @@ class Scene:
             size = view.radius_m * tuned.FRUSTUM_OF_RADIUS
             for node in self._nodes.values():
                 node.handle.scale = size
+        if self._viewpoint is None:  # more cameras may report: who has come waits
+            return
         for number, client in self._server.get_clients().items():
             self._place(number, client)
 

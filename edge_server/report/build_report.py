@@ -49,7 +49,7 @@ def assemble(files: RunFiles) -> dict[str, Any]:
     counted = updates(series, edge.updates or UpdateCounts())
     first_ms, ended_s = None, seconds
     if edge.kind == "live":
-        first_ms = counted["first_ms"]
+        first_ms = 1e3 * series[0].t_s if series and files.restarts_s else counted["first_ms"]
         ended_s = max((rows[-1].t_s for rows in (files.ages, series) if rows), default=seconds)
     late_s = last_share_s(first_ms, ended_s)
     report = {

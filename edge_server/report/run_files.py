@@ -73,24 +73,34 @@ def read_run_files(out: Path) -> RunFiles:
         path = out / f"{name}.png"
         if path.is_file():
             files.images[name] = path
-    timed: tuple[list[Any], ...] = (files.series, files.shown, files.ages)
-    for rows in timed:
-        for row, t_s in zip(rows, continuous([row.t_s for row in rows])):
+    starts_s = [0.0, *files.restarts_s] if files.restarts_s else []
+    timed: tuple[tuple[list[Any], list[float]], ...] = (
+        (files.ages, []),
+        (files.series, starts_s),
+        (files.shown, starts_s),
+    )
+    for rows, starts in timed:
+        placed = zip(rows, continuous([row.t_s for row in rows], starts))
+        kept = [(t_s, row) for row, t_s in placed if row.t_s > 0.0 or not starts]  # else it says nothing: a start
+        for t_s, row in kept:
             row.t_s = t_s
-        rows.sort(key=lambda row: row.t_s)
+        rows[:] = sorted((row for _, row in kept), key=lambda row: row.t_s)
     for usage, t_s in zip(files.processes, continuous([row["t_s"] for row in files.processes])):
         usage["t_s"] = t_s
     return files
 
 
-def continuous(times_s: Sequence[float]) -> list[float]:
+def continuous(times_s: Sequence[float], starts_s: Sequence[float] = ()) -> list[float]:
     """Seconds since a process first started, of rows in the order in which they were written: a step back by
-    more than ``LATE_S`` is a restart, which counts from zero again and goes on where the earlier rows end."""
+    more than ``LATE_S``, or to 0, is a restart, which counts from zero again and goes on where the earlier rows end.
+
+    starts_s: when each process started, where that is known and they are several: one may have written no row."""
     shift = last = 0.0
-    found = []
+    number, found = 0, list[float]()
     for t_s in times_s:
-        if t_s + shift < last - LATE_S:
-            shift = last
+        if t_s + shift < last - LATE_S or (t_s == 0.0 and (found or starts_s)):
+            number += 1
+            shift = last = starts_s[number] if number < len(starts_s) else last
         found.append(t_s + shift)
         last = max(last, t_s + shift)
     return found
@@ -99,7 +109,7 @@ def continuous(times_s: Sequence[float]) -> list[float]:
 def restarts(times_s: Sequence[float]) -> list[float]:
     """When the process that wrote such rows started again, on the scale of ``continuous``."""
     placed = continuous(times_s)
-    return [placed[k] for k in range(1, len(placed)) if times_s[k] < times_s[k - 1] - LATE_S]
+    return [placed[k] for k in range(1, len(placed)) if times_s[k] < times_s[k - 1] - LATE_S or times_s[k] == 0.0]
 
 
 def _read(path: Path, kind: type[T], notes: list[str], optional: bool = False) -> T | None:

@@ -64,6 +64,7 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     number = tmp_path / "plain" / "123.yaml"  # which YAML would not read as text
     printed(capsys, "scenario", "init", str(number), "--like", "quad")
     assert "valid" in printed(capsys, "scenario", "check", str(number))
+    assert "File exists" in refused(capsys, "scenario", "init", str(number / "in-a-file.yaml"))
     number.write_text('{cameras: {count: 2}, source: {kind: world}, channel: {service: "det:60ms"}}')
     assert "channel  its own: mean delay 60 ms" in printed(capsys, "scenario", "check", str(number))
     (tmp_path / "card").mkdir()

@@ -77,12 +77,25 @@ def test_a_process_that_dies_ends_the_run_is_named_and_the_others_are_stopped(as
     assert rows[0]["edge"]["pid"] == made.edge.pid and "machine" in rows[0]
 
 
-def test_a_recording_that_is_over_before_the_first_update_ends_the_run_well(asleep, capfd, monkeypatch):
-    """Kernels are still being compiled."""
+@pytest.mark.parametrize("full", [False, True])
+def test_a_recording_that_is_over_before_the_first_update_ends_the_run_well(asleep, capfd, monkeypatch, full):
+    """Kernels are still being compiled. full: the disk, which costs samples and the report."""
     run = asleep("import time; time.sleep(0.5)")
-    emulator = run.processes.emulator
+    emulator, prepared = run.processes.emulator, launcher.folder.prepare
+
+    def prepare_full(out, about):
+        lock = prepared(out, about)
+        for name in ("processes.jsonl", "log-report.txt"):
+            (out / name).symlink_to("/dev/full")
+        (out / "ledger-edge.tsv").touch()
+        return lock
+
+    if full:
+        monkeypatch.setattr(launcher.folder, "prepare", prepare_full)
     monkeypatch.setattr(run, "_continue_start", lambda now_s: emulator.process or emulator.start())
-    assert run.run() == 0 and "the recording is over" in capfd.readouterr().out
+    assert run.run() == full
+    said = capfd.readouterr().out
+    assert "the recording is over" in said and ("log-report.txt: No space left on device" in said) == full
 
 
 def test_a_run_whose_lines_nobody_reads_ends_as_at_ctrl_c(asleep, monkeypatch):
@@ -221,7 +234,7 @@ def test_an_earlier_run_is_replaced_and_a_link_in_it_is_not_followed(tmp_path):
     (precious / "photo").write_text("keep")
     out = tmp_path / "out"
     prepare(out, {"run": 1}).close()
-    for name in ("ledger-edge-edge-1.tsv", "frontier.json", ".edge.json.4f.part"):
+    for name in ("ledger-edge-edge-1.tsv", "frontier.json", ".edge.json.4f.part", "decision-000012.png"):
         (out / name).write_text("old")
     (out / "decisions").symlink_to(precious)
     prepare(out, {"run": 2}).close()

@@ -54,6 +54,13 @@ class Journal:
         """Number of lines that could not be written so far."""
         return sum(file.lost for file in self._files.values())
 
+    def begin(self) -> None:
+        """Where an earlier process, which may have published nothing, left lines, say in each file that another one
+        begins: by a line that says nothing, at 0 s."""
+        if (self._out / "ages.jsonl").stat().st_size:
+            for file in self._files.values():
+                file.write('{"t_s": 0.0, "age_ms": {}}')
+
     def published(self, publication: Publication) -> None:
         with self._lock:
             self._open[publication.number] = publication

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import shutil
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -71,11 +72,13 @@ class Recorder:
         return {"file": self.file.name, "written": self.written, "dropped": self.dropped, "failed": self._failed}
 
     def close(self) -> None:
-        """Write what is queued, and the index."""
+        """Write what is queued, and the index. A recording of nothing is removed: the next start takes its name."""
         with self._changed:
             self._closing = True
             self._changed.notify()
         self._thread.join()
+        if not self.written and not self._failed:
+            shutil.rmtree(self.file) if self.file.is_dir() else self.file.unlink(missing_ok=True)
 
     def _decision(self, topic: str, publication: Publication, t_ns: int | None = None) -> None:
         at = publication.published_ns if t_ns is None else t_ns

@@ -91,7 +91,8 @@ class FoxgloveServer(PageThread):
         self._all = [*self._images.values(), *self._lenses.values(), self._truth, self._moved, self._points]
         self._all += [self._ages, self._decisions, self._scores]
         self._sent: dict[str, tuple[str, int]] = {}
-        self._last_decision = self._last_score = -1
+        self._last_decision = -1
+        self._last_score: Publication | None = None
         self._render_due_s = self._points_due_s = 0.0
         try:
             self._server = foxglove.start_server(
@@ -165,8 +166,9 @@ class FoxgloveServer(PageThread):
                 self._last_decision = publication.number
                 self._decisions.log(asdict(publication), log_time=publication.published_ns)
         scored = self._state.newest(scored=True)
-        if scored is not None and scored.number != self._last_score and self._scores.has_sinks():
-            self._last_score = scored.number
+        # Of several held-out cameras each changes the score of the same update.
+        if scored is not None and scored is not self._last_score and self._scores.has_sinks():
+            self._last_score = scored
             self._scores.log(asdict(scored), log_time=self._state.now_ns())
 
     def _send_rendering(self, field: Snapshot, camera: CameraView) -> None:

@@ -7,8 +7,8 @@
     /tf                       tf2_msgs/TFMessage           world -> CAMERA, CAMERA -> CAMERA_depth; axes as OpenCV's
     /decisions, /scores       std_msgs/String              JSON
 
-Frames are the cameras' ids; in topics, what ROS does not allow becomes an underscore. A message's time in the bag is
-its arrival at the edge, its stamp the capture, both on the edge's clock.
+Frames are the cameras' ids; in topics, what ROS does not allow becomes an underscore, and camera_ goes before a digit.
+A message's time in the bag is its arrival at the edge, its stamp the capture, both on the edge's clock.
 """
 
 from __future__ import annotations
@@ -53,6 +53,7 @@ class BagWriter:
             self._bag.set_custom_data(name, value)
         self._bag.open()
         self._topics: dict[str, Any] = {}
+        self._names: dict[str, str] = {}  # of cameras in topics
 
     def frame(self, request: pb.PushRequest, arrived_ns: int) -> None:
         """Write all messages of a frame that arrived at ``arrived_ns`` on the edge's clock. Raises ValueError for an
@@ -61,7 +62,7 @@ class BagWriter:
         camera, codec = header.camera_id, CODEC_NAMES[header.codec]
         pose, lens = pose_and_lens(header)
         stamp_ns = max(0, header.generated_ns + header.clock_offset_ns)
-        at = "/" + _NOT_A_ROS_NAME.sub("_", camera)
+        at = f"/{self._name(camera)}"
         head = self._header(stamp_ns, camera)
         moved = [self._transform(stamp_ns, WORLD, camera, pose)]
         depth = depth_of(request.depth).decode() if request.HasField("depth") else None
@@ -100,6 +101,15 @@ class BagWriter:
         """Close the file without an index."""
         with suppress(OSError):
             self._bag.abort()
+
+    def _name(self, camera: str) -> str:
+        """The camera's own name in topics, which begins with no digit: ROS 2 allows no such topic."""
+        if camera not in self._names:
+            name = re.sub(r"^(?=\d)", "camera_", _NOT_A_ROS_NAME.sub("_", camera))
+            while name in self._names.values():
+                name += "_"
+            self._names[camera] = name
+        return self._names[camera]
 
     def _make(self, name: str, *values: Any) -> Any:
         return self._types.types[name](*values)

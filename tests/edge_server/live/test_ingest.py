@@ -140,9 +140,17 @@ TWO_NODES = [("s1", 10), ("s1", 20), ("s1", 30), ("s2", 31), ("s1", 40), ("s2", 
 RESTARTED = [("s1", 0), ("s1", 1), ("s2", 20), ("s1", 2), ("s2", 21), ("s1", 3), ("s2", 40)]
 
 
-@pytest.mark.parametrize(("arrivals", "doubled"), [(TWO_NODES, {"cam01": 1}), (RESTARTED, {})])
-def test_two_nodes_of_one_name_are_told_apart_and_said(arrivals, doubled, caplog):
-    admission = FrameAdmission(["cam01"], [])
+# The edge has started again, and both nodes go on.
+EDGE_RESTARTED = [("s1", 30), ("s2", 31), ("s1", 42)]
+KNOWN = {"cam01": {"s1": (20, 0), "s2": (21, 0)}}
+
+
+@pytest.mark.parametrize(
+    ("arrivals", "doubled", "known"),
+    [(TWO_NODES, {"cam01": 1}, {}), (RESTARTED, {}, {}), (EDGE_RESTARTED, {"cam01": 1}, KNOWN)],
+)
+def test_two_nodes_of_one_name_are_told_apart_and_said(arrivals, doubled, known, caplog):
+    admission = FrameAdmission(["cam01"], [], known=known)
     for session, tenths in arrivals:
         at_ns = NOW + tenths * 100 * MS
         admission.admit(frame(sequence=tenths, generated_ns=at_ns, session=session), NOW + 5 * 10**9)

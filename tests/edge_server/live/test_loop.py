@@ -134,6 +134,12 @@ def test_the_loop_publishes_renders_pauses_switches_resets_and_saves(tmp_path):
 
     run.controls.paused = True
     run.until(lambda: run.lines[-1] == "paused")
+    u.buffer._takes, shed = 1, u.buffer.shed
+    u.buffer.keep_every_frame(True)  # as for a field that wants them
+    run.until(lambda: u.buffer._unselected is None)
+    for sequence in range(1, 20):
+        u.buffer.put(frame("cam01", sequence=sequence, generated_ns=now + sequence), now + sequence)
+    assert u.buffer.shed == shed, "time was not what they lacked"
     count = len(run.published)
     time.sleep(0.4)
     assert len(run.published) == count

@@ -24,7 +24,7 @@ from edge_server.page.foxglove_live import FoxgloveServer, point_cloud
 from edge_server.page.foxglove_live.foxglove_constants import MOST_POINTS
 from freshfield.transport import TransportError
 from tests.conftest import ROOT
-from tests.edge_server.page.preview import CAMERAS, LENS, Preview
+from tests.edge_server.page.preview import CAMERAS, LENS, Preview, publication
 from tests.support import refusal, wait_until
 
 MESSAGE = struct.Struct("<BIQ")  # opcode 1, subscription, log time
@@ -104,6 +104,16 @@ def test_one_message_of_each_kind_and_the_layout_that_shows_them(served):
     assert len(shown) > 6
     for topic, _, value in (name.partition(".") for name in shown):
         assert not value or value in json.loads(client.channels[topic]["schema"])["properties"], topic
+
+
+def test_a_score_is_told_again_once_another_held_out_camera_is_in_it():
+    said, one = [], replace(publication(5), psnr_db=20.0)
+    scores = SimpleNamespace(has_sinks=lambda: True, log=lambda values, log_time: said.append(values["psnr_db"]))
+    told = SimpleNamespace(_scores=scores, _decisions=SimpleNamespace(has_sinks=lambda: False), _last_score=None)
+    for newest in (one, one, replace(one, psnr_db=21.0)):
+        told._state = SimpleNamespace(now_ns=lambda: 7, newest=lambda scored, newest=newest: newest)
+        FoxgloveServer._publications(told)
+    assert said == [20.0, 21.0]
 
 
 def test_where_no_camera_is_held_out_the_first_stands_for_it(served):

@@ -95,7 +95,7 @@ def test_a_decision_is_told_in_words():
         last = Publication(7, 1.0, 0, omega_ms, selected, (1.0,) * len(selected), 1.0, 20.0, **more)
         return markup.decision_words(last, cameras, policy)
 
-    assert "Update 8 uses all 6 views." in words(tuple(ages))
+    assert "Update 7 uses all 6 views." in words(tuple(ages))  # the number that the caption and explain use
     assert "waits 62 ms, then uses all 6 views." in words(tuple(ages), 62.0, "wait-arrived")
     old = words(("cam01", "cam03"), 120.0, "threshold")
     assert "uses 2 of 6 views, up to 120 ms old; leaves out cam02 (903 ms old), cam06 (800 ms old)" in old

@@ -71,17 +71,22 @@ def test_an_image_at_rest_has_a_band_for_every_tenth_of_a_second_that_the_last_o
 def test_one_camera_is_seen_from_before_it_then_from_the_fields_box_and_looked_through_as_the_field_corrects_it():
     seen = frame()
     state = bare_state([CameraView("cam01", False, seen, 1.0, 1, 0), CameraView("never", False, None, None, 0, 0)])
-    server = MagicMock()
-    server.get_clients.return_value = {}
+    server, client = MagicMock(), MagicMock()
+    server.get_clients.return_value = {0: client}
     scene = Scene(server, state)
     assert thumbnail(replace(seen, payload=b"\xff\xd8 nothing")) is None
+    scene.refresh(state.cameras(), watched=True)  # the other camera may report: nobody is moved yet
+    client.atomic.assert_not_called()
+    began, scene._first_seen = scene._first_seen, -1e3  # cameras may report one by one for any time
     scene._seen_at, scene._seen = -1.0, 1  # long enough ago: the other camera may never report
     scene.refresh(state.cameras(), watched=True)
+    np.testing.assert_array_equal(client.camera.position, scene._viewpoint.position)
+    scene._first_seen = began
     server.scene.add_camera_frustum.assert_called_once()
     np.testing.assert_array_equal(server.scene.add_camera_frustum.return_value.image, thumbnail(seen))
     ahead = scene._viewpoint.look_at - seen.pose.translation_m
     assert np.allclose(ahead, np.linalg.norm(ahead) * seen.pose.matrix()[:3, 2])
-    client, refined = MagicMock(), seen.pose.matrix()
+    refined = seen.pose.matrix()
     scene._look_through(client, "cam01")
     np.testing.assert_array_equal(client.camera.position, seen.pose.translation_m)
     assert client.camera.fov == pytest.approx(2 * np.arctan(0.5 * seen.intrinsics.height / seen.intrinsics.fy))

@@ -190,6 +190,17 @@ def test_rows_are_in_order_of_time_also_across_a_restart(tmp_path):
     files = read_run_files(tmp_path)
     assert [row.t_s for row in files.series][-2:] == pytest.approx([6.1, 9.2])
     assert [row.t_s for row in files.shown][-3:] == [9.9, 10.0, 10.05]
+    for published in ([], [publication(0)]):  # the first process waited for cameras, and published nothing
+        journal = Journal(tmp_path / "again", dict)
+        journal.begin()
+        for i in range(50):
+            journal.ages(0.2 + 0.2 * i, {})
+        for each in published:
+            journal.published(each)
+        journal.close()
+    files = read_run_files(tmp_path / "again")
+    assert files.restarts_s == [10.0] and [row.t_s for row in files.series] == pytest.approx([10.0 + published[0].t_s])
+    assert files.shown == [] and assemble(files)["fidelity"]["late_s"] == pytest.approx(20.0 - 0.2 * (20.0 - 13.1))
 
 
 def test_a_held_out_camera_that_moves_is_drawn_and_tabled_at_refined_poses(tmp_path, monkeypatch) -> None:
@@ -317,7 +328,10 @@ def test_the_age_of_what_was_shown_is_told_without_a_held_out_camera(tmp_path):
     write_run(tmp_path)
     (tmp_path / "shown.jsonl").unlink()
     series = (tmp_path / "series.jsonl").read_text().replace('"scored_on": "cam00"', f'"scored_on": "{SELECTED}"')
-    (tmp_path / "series.jsonl").write_text(series.replace('"network_ms": null', '"network_ms": 50.0'))
+    lines = series.replace('"network_ms": null', '"network_ms": 50.0').splitlines()
+    again = json.loads(lines[-1])  # of an edge that was killed and resumed from a checkpoint: its number, too
+    lines.append(json.dumps(again | {"t_s": again["t_s"] + 0.75}))
+    (tmp_path / "series.jsonl").write_text("".join(line + "\n" for line in lines))
     report, page = page_of(tmp_path)
     assert NOTHING_HELD_OUT in page.split("<h2>Age")[0]
     age = report["fidelity"]["shown"]["age_ms"]
