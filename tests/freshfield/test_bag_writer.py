@@ -81,7 +81,7 @@ def test_rosbags_reads_what_was_sent(tmp_path):
     assert (beside.header.frame_id, beside.transform.translation.x) == ("cam01", 0.05)
     assert json.loads(found["/decisions"][0][1].data)["number"] == PUBLICATION.number
     names = record(tmp_path / "names", list(requests(6, ("15", "a.b", "a_b"))))._writer._names
-    assert names == {"15": "camera_15", "a.b": "a_b", "a_b": "a_b_"}, "no topic of two, none that begins with a digit"
+    assert names == {"15": "camera_15", "a.b": "a_b", "a_b": "a_b_2"}, "no topic of two, none that begins with a digit"
 
 
 def test_our_reader_gives_the_same_pixels_and_depth_in_whole_millimeters(tmp_path):

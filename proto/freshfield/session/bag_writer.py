@@ -38,7 +38,7 @@ except ImportError:
 _VERSION: Literal[9] = 9  # of the bag's metadata: ROS 2 Jazzy
 _VIEWED = ("jpeg", "png")
 _MILLIMETER = 0.001
-_NOT_A_ROS_NAME = re.compile(r"[^A-Za-z0-9_]")
+_NOT_A_ROS_NAME = re.compile(r"[^A-Za-z0-9]+")  # repeated underscores are none either
 
 
 class BagWriter:
@@ -105,10 +105,9 @@ class BagWriter:
     def _name(self, camera: str) -> str:
         """The camera's own name in topics, which begins with no digit: ROS 2 allows no such topic."""
         if camera not in self._names:
-            name = re.sub(r"^(?=\d)", "camera_", _NOT_A_ROS_NAME.sub("_", camera))
-            while name in self._names.values():
-                name += "_"
-            self._names[camera] = name
+            allowed = re.sub(r"^(?=\d)", "camera_", _NOT_A_ROS_NAME.sub("_", camera))
+            names = (allowed, *(f"{allowed}_{k}" for k in range(2, len(self._names) + 3)))
+            self._names[camera] = next(name for name in names if name not in self._names.values())
         return self._names[camera]
 
     def _make(self, name: str, *values: Any) -> Any:
