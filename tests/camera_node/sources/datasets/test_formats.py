@@ -362,6 +362,7 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
     "colmap text": [
         (replaced("sparse/0/cameras.txt", b"PINHOLE", b"OPENCV"), "OPENCV has 8 parameters, not 4"),
         (changed("sparse/0/images.txt", lambda d: d[:-1].rpartition(b"\n")[0]), "points is missing: cut"),
+        (changed("sparse/0/images.txt", lambda d: d.replace(b"\n\n", b"\n")), "points is missing: cut"),
     ],
     "colmap": [
         (changed("sparse/0/images.bin", lambda d: d + b"more"), "4 bytes follow its last"),
