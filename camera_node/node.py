@@ -235,13 +235,15 @@ class Node:
         failed = sum(trouble["failed"] for trouble in self._trouble.values())
         if not counts["captured"]:
             return f"no frame could be captured ({failed} tries)" if failed else None
+        why = next((sender.trouble for sender in self.senders.values() if sender.trouble), "")
         if not any(sender.connections for sender in self.senders.values()):
-            why = next((sender.trouble for sender in self.senders.values() if sender.trouble), "no connection in time")
-            return f"{self._options.to} was never reached: {why}"
+            return f"{self._options.to} was never reached: {why or 'no connection in time'}"
+        if any(counts[outcome] for outcome in TAKEN):
+            return None
         refused = {name: n for name, n in counts.items() if name.startswith("rejected:")}
-        if refused and not any(counts[outcome] for outcome in TAKEN):
+        if refused:
             return f"all frames were refused: {', '.join(f'{name[9:]} {n}' for name, n in refused.items())}"
-        return None
+        return f"{self._options.to} answered no frame: {why}" if why else None
 
     def _enter(self, phase: str) -> None:
         self.phase = phase
