@@ -189,6 +189,7 @@ def test_a_depth_sensor_measures_with_every_camera_but_the_held_out_one_and_chan
 
 def test_a_bumped_camera_shows_another_view_from_then_on_and_reports_its_old_pose():
     bump = {"at_s": 1.0, "pitch_deg": 1.0, "cameras": ["cam01"]}
+    refused(ScenarioError, "effects.bump.cameras: 'cam1' is not one", cameras, {"bump": {**bump, "cameras": ["cam1"]}})
     found, plain = cameras({"bump": bump, "depth_sensor": {}}), cameras({"depth_sensor": {}})
 
     def made(camera: Camera, tick: int) -> tuple[Any, ...]:
