@@ -85,14 +85,14 @@ def robot(frames: int = 3) -> list:
     return said
 
 
-def write(where: Path, said: list, storage: str = "MCAP") -> Path:
+def write(where: Path, said: list, storage: str = "MCAP", later_ns: int = 1) -> Path:
     """Write (topic, log time or 0: a little after the last, message)."""
     with rosbag2.Writer(where, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as bag:
         topics, last = {}, START_NS
         for topic, t_ns, message in sorted(said, key=lambda each: each[1] or last):
             if topic not in topics:
                 topics[topic] = bag.add_connection(topic, message.__msgtype__, typestore=STORE)
-            last = max(last + 1, t_ns + 5_000_000)
+            last = max(last + later_ns, (t_ns + 5_000_000) * later_ns)
             bag.write(topics[topic], last, STORE.serialize_cdr(message, message.__msgtype__))
     return where
 
@@ -149,6 +149,12 @@ def test_encodings_of_images_and_of_depth(tmp_path, message, expected):
     bag = write(tmp_path / "run", [*robot(), *(pictures(1)[:1] if is_depth else []), ("/any", START_NS, message)])
     record = open_dataset(bag)[1][0]
     assert np.array_equal(record.depth().counts if is_depth else record.read(), expected)
+
+
+def test_images_of_a_topic_that_were_logged_at_the_same_time_are_told_apart(tmp_path):
+    second = [("/camera/image_raw", 1, image(START_NS + 10**8, "rgb8", PICTURE[::-1]))]
+    found = open_dataset(write(tmp_path / "run", robot() + pictures(1) + second, later_ns=0))[1]
+    assert [np.array_equal(each.read(), PICTURE[::-1]) for each in found] == [False, True]
 
 
 def test_of_several_topics_of_a_frame_one_is_taken_and_named(tmp_path):
