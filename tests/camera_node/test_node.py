@@ -205,6 +205,7 @@ def test_depth_is_cached_encoded_and_its_bytes_count():
         ({"intrinsics": Pinhole.from_fov(8, 8, 60)}, "a lens of"),
         ({"unit": float("nan")}, "nan m a count is not within"),
         ({"error": OSError("depth/007.png: no such file")}, "depth/007.png: no such file"),
+        ({"error": KeyError("of a plug-in")}, "KeyError('of a plug-in')"),
     ],
 )
 def test_depth_that_cannot_be_sent_costs_only_the_depth(caplog, wrong, message):
