@@ -203,7 +203,8 @@ def _target(args: argparse.Namespace) -> int:
     image = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
     # Detectors need a white border.
     border = max(8, width // 10)
-    if not cv2.imwrite(str(args.out), np.pad(image, border, constant_values=255)):
+    out = str(args.out)
+    if not (cv2.haveImageWriter(out) and cv2.imwrite(out, np.pad(image, border, constant_values=255))):
         raise CalibrationError(f"--out: {args.out} cannot be written (does its folder exist? .png?)")
     print(
         f"{args.out}: print it at {args.dpi:g} dpi without scaling; without its white border it must measure "
