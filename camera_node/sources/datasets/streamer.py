@@ -79,6 +79,9 @@ def open_recorded(
             f"{path}: has masks of pixels that must not be learned from, which a stream cannot carry: use edge-server "
             "fit, or leave the masks out"
         )
+    if wrong := [name for name in config.assignment.values() if name not in found.cameras]:
+        there = ", ".join(found.cameras) or "none that has a name"
+        raise ScenarioError(f"{scenario.path}: source.assignment: the data has no camera {wrong[0]!r} (it has {there})")
     path_of_one = len(scenario.cameras) == 1 == len(found.cameras) and all(image.time_s is not None for image in found)
     if found.moving or found.per_camera or path_of_one:
         names = {cameras[0]: found.cameras[0]} if path_of_one else {}

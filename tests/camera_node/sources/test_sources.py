@@ -38,6 +38,8 @@ def test_a_recording_is_assigned_by_name(tmp_path):
         (3, {"cam01": "cam00"}, "more than one camera shows cam00"),
     ):
         refused(ScenarioError, message, opened, photo_scenario(data, count, assignment=assignment))
+    photos = photo_scenario(write_photos(tmp_path / "photos", 9), assignment={"cam01": "left"})
+    refused(ScenarioError, "the data has no camera 'left' .it has none that has a name", opened, photos)
 
 
 @pytest.mark.parametrize(("fps", "time_unit_s"), [(0, 1.0), (1e9, 1.0), (None, 1e308), (None, 1e-320)])
