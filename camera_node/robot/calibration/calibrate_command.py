@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
+from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError, require_one_input
 from camera_node.robot.calibration.rig import rig_command
 
 EXAMPLES = """examples:
@@ -121,19 +121,8 @@ def run(args: argparse.Namespace) -> int:
         raise CalibrationError(str(error)) from None
 
 
-def _require_one_input(args: argparse.Namespace) -> None:
-    """Raise CalibrationError unless one input is given, and only options that it uses."""
-    given = [name for name in _INPUTS if getattr(args, name) is not None]
-    if len(given) != 1:
-        raise CalibrationError(f"expected one of {', '.join(_INPUTS.values())}")
-    for option, inputs in _GOES_WITH.items():
-        if getattr(args, option) is not None and given[0] not in inputs:
-            names = " or ".join(_INPUTS[name] for name in inputs)
-            raise CalibrationError(f"--{option}: goes with {names}, not with {_INPUTS[given[0]]}")
-
-
 def _hand_eye(args: argparse.Namespace) -> int:
-    _require_one_input(args)
+    require_one_input(args, _INPUTS, _GOES_WITH)
     from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
     from camera_node.robot.calibration.targets import parse_target
 
