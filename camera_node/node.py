@@ -233,10 +233,10 @@ class Node:
         """After ``run``: why no frame was taken; None if one was, or there was no time for any."""
         counts = sum((outbox.counts for outbox in self.outboxes.values()), Counter())
         failed = sum(trouble["failed"] for trouble in self._trouble.values())
-        if not counts["captured"]:
-            return f"no frame could be captured ({failed} tries)" if failed else None
+        if failed and not counts["captured"]:
+            return f"no frame could be captured ({failed} tries)"
         why = next((sender.trouble for sender in self.senders.values() if sender.trouble), "")
-        if not any(sender.connections for sender in self.senders.values()):
+        if (why or counts["captured"]) and not any(sender.connections for sender in self.senders.values()):
             return f"{self._options.to} was never reached: {why or 'no connection in time'}"
         if any(counts[outcome] for outcome in TAKEN):
             return None

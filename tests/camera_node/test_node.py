@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from fractions import Fraction
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from unittest.mock import AsyncMock, MagicMock
@@ -152,6 +153,18 @@ async def test_pauses_grow_until_a_session_has_worked(monkeypatch):
 def test_a_node_that_reached_nobody_ends_with_1(capsys):
     assert main(["run", "tile", "--camera-index", "0", "--to", NOBODY, "--seconds", "0.2", "--quiet"]) == 1
     assert f"camera-node: {NOBODY} was never reached: " in capsys.readouterr().err
+
+
+async def test_a_recording_that_waited_for_nobody_says_so(monkeypatch):
+    monkeypatch.setattr(sender_module.tuned, "CONNECT_S", 0.1)
+    eye = Eye("cam01")
+    monkeypatch.setattr(eye, "schedule", partial(OnceSchedule, [0]))
+    node = node_of([eye])
+    running = asyncio.ensure_future(node.run())
+    await until(lambda: node.senders and node.senders["cam01"].trouble, 8.0)
+    node.stop()
+    await running
+    assert node.failure() == f"{NOBODY} was never reached: peer not reachable"
 
 
 def test_the_cache_never_exceeds_its_bound_and_keeps_what_it_has():
