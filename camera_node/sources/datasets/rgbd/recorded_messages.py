@@ -319,7 +319,8 @@ def _again(messages: Messages, place: _Place) -> Picture:
 def _read_image(messages: Messages, place: _Place, lens: Lens, options: ImageOptions) -> Image:
     picture, where = _again(messages, place), f"{messages.where}: {place[2]}"
     if picture.encoding == COMPRESSED:
-        image = _decoded(picture, cv2.IMREAD_COLOR, 0, where)[..., ::-1]
+        # As stored, whatever EXIF says of its orientation: the lens is of the stored pixels.
+        image = _decoded(picture, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, 0, where)[..., ::-1]
     else:
         channels, conversion = _COLORS[picture.encoding]
         image = _pixels(picture, np.dtype(np.uint8), channels, where)

@@ -11,6 +11,7 @@ from camera_node.sources.datasets.formats import open_dataset
 from edge_server.experiments.scenes.recorded import load_recorded
 from freshfield.geometry import Pose, look_at
 from tests.camera_node.sources.datasets.photos import fails, opened
+from tests.support import turned_jpeg
 
 mcap = pytest.importorskip("mcap_protobuf.writer", reason="needs the extra mcap")
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra ros")
@@ -130,6 +131,7 @@ def png(values: np.ndarray) -> bytes:
     return cv2.imencode(".png", values)[1].tobytes()
 
 
+JPEG = cv2.imencode(".jpg", PICTURE)[1].tobytes()
 BAYER = np.random.default_rng(3).integers(0, 256, (24, 32), dtype=np.uint8)
 
 
@@ -140,6 +142,7 @@ BAYER = np.random.default_rng(3).integers(0, 256, (24, 32), dtype=np.uint8)
         (image(START_NS, "mono8", PICTURE[..., 0]), PICTURE[..., [0, 0, 0]]),
         (image(START_NS, "bayer_rggb8", BAYER), cv2.cvtColor(BAYER, cv2.COLOR_BayerRGGB2RGB)),
         (compressed(START_NS, "rgb8; png compressed bgr8", png(PICTURE[..., ::-1])), PICTURE),
+        (compressed(START_NS, "jpeg", turned_jpeg(JPEG, 3)), cv2.imdecode(np.frombuffer(JPEG, np.uint8), 1)[..., ::-1]),
         (image(START_NS, "16UC1", MM.astype(">u2"), big=True), MM),
         (compressed(START_NS, "16UC1; compressedDepth png", bytes(12) + png(MM)), MM),
     ],
