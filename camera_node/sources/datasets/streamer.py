@@ -86,7 +86,7 @@ def open_recorded(
     if found.moving or found.per_camera or path_of_one:
         names = {cameras[0]: found.cameras[0]} if path_of_one else {}
         names = names or assign_cameras(scenario, config.assignment, cameras, found.cameras)
-        shown = {camera: found.of(name) for camera, name in names.items()}
+        shown = {camera: _shown(found, name, camera in scenario.held_out) for camera, name in names.items()}
         recorded = {camera: _recorded_fps(found, shown[camera], path) for camera in cameras}
         timeline = Timeline.of(found, path)
         order = {camera: timeline.nearest(images) for camera, images in shown.items()}
@@ -115,6 +115,13 @@ def open_recorded(
             playback = Playback(len(shots), playback.fps, playback.fps)
         sources[camera] = ImageSource(camera, shown[camera], shots, playback, config.codec, poses.get(camera))
     return sources
+
+
+def _shown(dataset: Dataset, name: str, held_out: bool) -> tuple[PosedImage, ...]:
+    """The images of a camera of a recording; of one that is trained on without the data set's own test images, unless
+    it has no others."""
+    images = dataset.of(name)
+    return tuple(image for image in images if held_out or image.name not in dataset.held_out) or images
 
 
 def split_photos(

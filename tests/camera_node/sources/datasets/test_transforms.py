@@ -200,6 +200,9 @@ def test_a_split_of_the_datas_own(tmp_path):
     kept = opened(photo_scenario(file.parent))["cam00"]
     truth = {kept.read(k).image.tobytes() for k in range(kept.contents)}
     assert truth == {r.read().tobytes() for r in found if r.name in found.held_out}
+    file = edited(write_photos(tmp_path / "d", 5, cameras=2), test_filenames=[names[3]])
+    seen = opened(photo_scenario(file, 2, assignment={"cam00": "cam01", "cam01": "cam00"}))["cam01"]
+    assert [(seen.read(k).image == picture(n)[..., ::-1]).all() for k, n in enumerate((0, 1, 2, 4))] == [True] * 4
 
 
 def test_orientation_and_size_are_what_the_camera_says(tmp_path):
