@@ -49,6 +49,7 @@ class AffectedSource(Derived):
 
     def __init__(self, source: Source, effects: Effects, codec: str) -> None:
         super().__init__(source, source.camera)
+        self.repeats_after, self.timed = source.repeats_after, source.timed
         self._each_differs = bool(effects.image) or effects.pose_varies
         self.contents = None if self._each_differs else source.contents
         self._effects, self._codec = effects, codec

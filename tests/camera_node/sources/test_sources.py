@@ -228,6 +228,7 @@ def test_recordings_stand_where_they_stood_and_are_sent_as_they_lie_with_a_wrong
             build_cameras(scenario, source_config(scenario), scenario.cameras)
     scenario = photo_scenario(data, cameras=3, fps=5, effects={"pose_noise": {}})
     truth, wrong = build_cameras(scenario, source_config(scenario), ["cam00", "cam01"])
+    assert (wrong.source.repeats_after, wrong.source.timed) == (20, False), "as of the eleven photos without errors"
     shot = wrong.capture(1)
     np.testing.assert_array_equal(payload.decode(shot.payload, "png", 32, 24), picture(3)[..., ::-1])
     assert not np.allclose(shot.pose.matrix(), pose_of(3), atol=1e-6)
