@@ -108,8 +108,9 @@ def open_recorded(
                 f"{shown[camera][0].camera}"
             )
         shots = order.get(camera, range(len(shown[camera])))
-        steps_per_s = timeline.fps if camera in order else fps
-        playback = Playback(len(shots), rate(config.fps) if config.fps else fps, steps_per_s)
+        ticks_per_s = rate(config.fps) if config.fps else fps
+        # Photos have no rate of their own: each tick shows the next one.
+        playback = Playback(len(shots), ticks_per_s, timeline.fps if timeline.count else ticks_per_s)
         if scenario.held_out_every:
             shots = [shots[n] for n in playback.whole_groups(scenario.held_out_every)]
             playback = Playback(len(shots), playback.fps, playback.fps)

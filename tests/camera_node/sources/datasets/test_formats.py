@@ -197,6 +197,14 @@ def test_formats_are_recognized_and_streamed_at_their_pace(tmp_path, name):
         assert isinstance(shot.image, bytes) == (name != "dynerf"), "what is a JPEG already is sent as it is"
 
 
+def test_each_photo_of_a_tower_is_shown_at_any_rate(tmp_path):
+    SETS["eyeful"][0](tmp_path / "set")
+    source = {"kind": "eyeful", "data": "set", "fps": 5}
+    scenario = parse({"cameras": {"ids": ["10", "11"]}, "source": source}, tmp_path / "s.yaml")
+    shown = opened(scenario)["10"]
+    assert [shown.content(tick) for tick in range(shown.contents)] == [*range(shown.contents)]
+
+
 @pytest.mark.parametrize(
     "lens",
     [
