@@ -88,7 +88,8 @@ def open_recorded(
         names = names or assign_cameras(scenario, config.assignment, cameras, found.cameras)
         shown = {camera: _shown(found, name, camera in scenario.held_out) for camera, name in names.items()}
         recorded = {camera: _recorded_fps(found, shown[camera], path) for camera in cameras}
-        timeline = Timeline.of(found, path)
+        used = [config.assignment.get(camera, camera) for camera in scenario.cameras]
+        timeline = Timeline.of(found, found.cameras if path_of_one else used, path)
         order = {camera: timeline.nearest(images) for camera, images in shown.items()}
     else:
         own = [i for i, image in enumerate(found) if image.name in found.held_out]
@@ -154,9 +155,10 @@ class Timeline:
     fps: Fraction
 
     @staticmethod
-    def of(dataset: Dataset, path: Path) -> Timeline:
-        """From the first instant to the last that all cameras have, at the fastest one's rate. Raises DatasetError."""
-        cameras = [dataset.of(camera) for camera in dataset.cameras]
+    def of(dataset: Dataset, used: Sequence[str], path: Path) -> Timeline:
+        """From the first instant to the last that all cameras in use have, at the fastest one's rate. Raises
+        DatasetError."""
+        cameras = [dataset.of(camera) for camera in dataset.cameras if camera in used]
         fps = max(_recorded_fps(dataset, images, path) for images in cameras)
         times = [(images[0].time_s, images[-1].time_s) for images in cameras if len(images) > 1]
         known = [(first, last) for first, last in times if first is not None and last is not None]

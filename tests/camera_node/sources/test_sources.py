@@ -64,10 +64,11 @@ def test_a_jpeg_of_the_right_size_is_sent_as_it_lies_unless_it_is_cut(tmp_path):
 
 
 def test_a_timeline_holds_what_all_cameras_have_at_the_fastest_ones_rate():
-    times = {"fast": [0.2, 0.3, 0.4, 0.6, 0.7, 0.8], "slow": [0.0, 0.2, 0.4, 0.6], "once": [5.0]}
+    times = {"fast": [0.2, 0.3, 0.4, 0.6, 0.7, 0.8], "slow": [0.0, 0.2, 0.4, 0.6], "once": [5.0], "unused": [8.0, 9.0]}
     rows, lens = [(camera, t_s) for camera in times for t_s in times[camera]], Pinhole(8, 8, 8, 8, 4, 4)
     images = (PosedImage(f"{camera}{t_s}", camera, t_s, np.eye(4), lens, lambda: None) for camera, t_s in rows)
-    assert Timeline.of(Dataset(tuple(images)), Path("set")) == Timeline(0.2, 5, Fraction(10))
+    found = Timeline.of(Dataset(tuple(images)), ["fast", "slow", "once", "unknown"], Path("set"))
+    assert found == Timeline(0.2, 5, Fraction(10))
 
 
 WORLD = {"kind": "world", "width": 16, "height": 12, "fps": 10, "carried": ["hand"], "params": {"people": 0}}
