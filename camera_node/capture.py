@@ -161,9 +161,10 @@ class Camera:
             depth = self._encode_depth(content, shot)
             if depth is not None:
                 depth.check(shot.intrinsics, image_bytes)
-        except (ValueError, OSError) as error:
+        except Exception as error:  # a source from outside raises anything
             if not self.depth_failed:
-                log.warning("%s: a frame without its depth: %s (further ones are only counted)", self.name, error)
+                why = error if isinstance(error, ValueError | OSError) else repr(error)
+                log.warning("%s: a frame without its depth: %s (further ones are only counted)", self.name, why)
             self.depth_failed += 1
             return None
         return depth

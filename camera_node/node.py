@@ -233,15 +233,17 @@ class Node:
         """After ``run``: why no frame was taken; None if one was, or there was no time for any."""
         counts = sum((outbox.counts for outbox in self.outboxes.values()), Counter())
         failed = sum(trouble["failed"] for trouble in self._trouble.values())
-        if not counts["captured"]:
-            return f"no frame could be captured ({failed} tries)" if failed else None
-        if not any(sender.connections for sender in self.senders.values()):
-            why = next((sender.trouble for sender in self.senders.values() if sender.trouble), "no connection in time")
-            return f"{self._options.to} was never reached: {why}"
+        if failed and not counts["captured"]:
+            return f"no frame could be captured ({failed} tries)"
+        why = next((sender.trouble for sender in self.senders.values() if sender.trouble), "")
+        if (why or counts["captured"]) and not any(sender.connections for sender in self.senders.values()):
+            return f"{self._options.to} was never reached: {why or 'no connection in time'}"
+        if any(counts[outcome] for outcome in TAKEN):
+            return None
         refused = {name: n for name, n in counts.items() if name.startswith("rejected:")}
-        if refused and not any(counts[outcome] for outcome in TAKEN):
+        if refused:
             return f"all frames were refused: {', '.join(f'{name[9:]} {n}' for name, n in refused.items())}"
-        return None
+        return f"{self._options.to} answered no frame: {why}" if why else None
 
     def _enter(self, phase: str) -> None:
         self.phase = phase

@@ -36,8 +36,9 @@ KEPT_POSES_NS, RESTART_POSES = 2_000_000_000, 8
 TRACKER_LOOKS_S = 0.005
 # A frame waits so long for its pose: trackers take 20 to 60 ms, and captures are 67 ms apart.
 TRACKER_LATE_S = 0.1
-# Bytes read at once, compared again later, and longest line that is kept: one has some 100.
+# Bytes compared again later, and longest line that is kept: one has some 100.
 TRACKER_LINE_BYTES = 4096
+TRACKER_TAIL_BYTES = 65_536  # read at once, and of a longer file at first: more than KEPT_POSES_NS at 300 a second
 TRACKER_JOIN_S = 2.0  # for its thread to end
 # Absolute value of a time stamp in a file: the difference of two fits in 64 bits of nanoseconds. Counted from 1970 it
 # is the year 2115; larger ones have another unit.

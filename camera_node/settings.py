@@ -269,6 +269,11 @@ def source_config(scenario: Scenario) -> SourceConfig:
     with errors_of(f"{where}.kind"):
         model = MODELS.get(kind) or own_class(kind)[1]
     config = read_settings(model, scenario.source, where)
+    if isinstance(config, LiveConfig | VideoConfig):
+        files = {} if config.trajectory is None else config.trajectory.files
+        for key, named in (("devices", getattr(config, "devices", {})), ("trajectory.files", files)):
+            if unknown := [camera for camera in named if camera not in scenario.cameras]:
+                raise ScenarioError(f"{where}.{key}.{unknown[0]}: not a camera of this scenario")
     if scenario.phase != "locked" and not isinstance(config, WorldConfig):
         raise ScenarioError(
             f"{scenario.path}: cameras.phase: {scenario.phase} is for source.kind world alone, others capture when "

@@ -29,9 +29,9 @@ def check(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
         scenario = replace(scenario, cameras=scenario.training, held_out=())
     said = []
     for camera, source in open_sources(scenario, config, scenario.training, data).items():
-        images, poses, focal_px = _captures(source, config.codec)
+        images, poses, focal_px, period_ms = _captures(source, config.codec)
         if len(images) >= tuned.POSES_LEAST_CAPTURES:
-            said.append(f"{camera} {compare(images, poses, focal_px, 1e3 / float(source.fps))}")
+            said.append(f"{camera} {compare(images, poses, focal_px, period_ms)}")
     return "; ".join(said)
 
 
@@ -81,34 +81,38 @@ def _correlation(shifts: Array, expected: Array, lag: float) -> float:
     return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-12))
 
 
-def _captures(source: Source, codec: str) -> tuple[list[NDArray[np.float32]], Array, float]:
-    """Small gray images and poses of consecutive captures, and the images' focal length; none of a camera that stands
-    still."""
+def _captures(source: Source, codec: str) -> tuple[list[NDArray[np.float32]], Array, float, float]:
+    """Small gray images and poses of consecutive captures, the images' focal length, and the time between two, ms; none
+    of a camera that stands still."""
     images: list[NDArray[np.float32]] = []
     poses: list[Array] = []
+    ticks: list[int] = []
     focal_px = 1.0
     for tick in range(tuned.POSES_CAPTURES):
         if len(images) == tuned.POSES_LEAST_CAPTURES and _equal(poses):
             break
-        if tick and source.content(tick) <= source.content(tick - 1):
+        if tick and source.content(tick) < source.content(tick - 1):
             break  # the recording plays back, where late poses are early
+        if tick and source.content(tick) == source.content(tick - 1):
+            continue  # the rate is higher than the recording's
         try:
             shot = source.read(source.content(tick))
         except ValueError:  # before the first pose of a trajectory, after its last, or a damaged file: others report it
             if len(images) >= tuned.POSES_LEAST_CAPTURES:
                 break
-            images, poses = [], []  # shifts are found between consecutive captures
+            images, poses, ticks = [], [], []  # shifts are found between consecutive captures
             continue
         lens = shot.intrinsics
         gray = cv2.cvtColor(pixels(shot, codec)[..., :3], cv2.COLOR_RGB2GRAY)
         size = (tuned.POSES_WIDTH_PX, max(1, round(tuned.POSES_WIDTH_PX * lens.height / lens.width)))
         images.append(cv2.resize(gray, size, interpolation=cv2.INTER_AREA).astype(np.float32))
         poses.append(shot.pose.matrix())
+        ticks.append(tick)
         focal_px = lens.fx * tuned.POSES_WIDTH_PX / lens.width
     source.release()
     if _equal(poses):
-        return [], np.empty((0, 4, 4)), 1.0
-    return images, np.array(poses), focal_px
+        return [], np.empty((0, 4, 4)), 1.0, 1.0
+    return images, np.array(poses), focal_px, 1e3 * (ticks[-1] - ticks[0]) / (len(ticks) - 1) / float(source.fps)
 
 
 def _equal(poses: list[Array]) -> bool:

@@ -25,7 +25,7 @@ log = logging.getLogger("camera-node")
 
 class TrackerPoses:
     """The poses in ``path``, followed by a thread until ``close``. The file may come later, be replaced, or be written
-    over in place: then it is read from its beginning.
+    over in place: then its end is read anew, the newest line first, until one that is known.
 
     interpolate, max_gap_ns: as of ``SampleBuffer``. refused: number of lines that are no pose.
     """
@@ -64,30 +64,35 @@ class TrackerPoses:
         file = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)
         try:
             opened, taken, rest, last = os.fstat(file), 0, b"", b""
-            is_file = stat.S_ISREG(opened.st_mode)
+            is_file = first = stat.S_ISREG(opened.st_mode)
+            if is_file and opened.st_size > tuned.TRACKER_TAIL_BYTES:
+                taken = os.lseek(file, -tuned.TRACKER_TAIL_BYTES, os.SEEK_END)
+            cut = int(taken > 0)  # whether it begins within a line
             while not self._stop.is_set():
                 data = b""
                 with contextlib.suppress(BlockingIOError):  # a pipe whose writer has nothing to say
-                    data = os.read(file, tuned.TRACKER_LINE_BYTES)
+                    data = os.read(file, tuned.TRACKER_TAIL_BYTES)
                 if is_file and os.pread(file, len(last), taken - len(last)) != last:
                     return
                 taken, last = taken + len(data), (last + data)[-tuned.TRACKER_LINE_BYTES :]
                 *lines, rest = (rest + data).split(b"\n")
                 rest = rest[-tuned.TRACKER_LINE_BYTES :]
-                for line in lines:
-                    self._add(line)
+                for line in reversed(lines[cut:]) if first else lines:
+                    if not self._add(line) and first:
+                        break
+                first = first and not lines
                 if os.stat(self.path).st_ino != opened.st_ino or (not data and self._stop.wait(tuned.TRACKER_LOOKS_S)):
                     return
         finally:
             os.close(file)
 
-    def _add(self, line: bytes) -> None:
+    def _add(self, line: bytes) -> bool:
+        """Whether the line holds no pose that was known, or too old."""
         try:
             sample = read_sample(line.decode(errors="replace"), str(self.path))
         except DatasetError as error:
             self.refused += 1
             if self.refused == 1:
                 log.warning("%s; lines that are no pose are left out", error)
-            return
-        if sample is not None:
-            self._samples.add(*sample)
+            return True
+        return sample is None or self._samples.add(*sample)

@@ -34,7 +34,7 @@ log = logging.getLogger("camera-node")
 class ReplaySource(Source):
     """One camera of a session.
 
-    times_ns: capture times of its frames since the session's first frame, strictly increasing.
+    times_ns: capture times of its frames since the first frame of the scenario's cameras, strictly increasing.
     """
 
     def __init__(self, camera: str, session: Session, frames: Sequence[SessionFrame], times_ns: Sequence[int]) -> None:
@@ -75,8 +75,9 @@ def open_replay(scenario: Scenario, config: McapConfig, cameras: Sequence[str], 
     if not session.frames:
         raise DatasetError(f"{path}: holds no frames of any camera")
     times = {name: _times(frames) for name, frames in session.frames.items()}
-    first = min(t[0] for t in times.values())
     names = assign_cameras(scenario, config.assignment, cameras, list(session.frames))
+    used = [config.assignment.get(camera, camera) for camera in scenario.cameras]  # by any node of the scenario
+    first = min(t[0] for name, t in times.items() if name in used)
     sources: dict[str, Source] = {}
     for camera, name in names.items():
         frames, kept = _in_order(name, session.frames[name], times[name])

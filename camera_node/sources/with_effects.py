@@ -28,6 +28,11 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
     with errors_of(f"{scenario.path}: source.effects"):
         held_out = camera in scenario.held_out
         effects = load_effects(config.effects, lambda name: scenario.rng(f"effect {name}", camera), held_out, camera)
+    for name, given in config.effects.items():
+        if unknown := [each for each in (given or {}).get("cameras", ()) if each not in scenario.cameras]:
+            raise ScenarioError(
+                f"{scenario.path}: source.effects.{name}.cameras: {unknown[0]!r} is not one of the cameras"
+            )
     if config.kind != "world" and (effects.delay or effects.mount):
         raise ScenarioError(
             f"{scenario.path}: source.effects: effects of the kinds delay and mount need source kind world"
@@ -44,6 +49,7 @@ class AffectedSource(Derived):
 
     def __init__(self, source: Source, effects: Effects, codec: str) -> None:
         super().__init__(source, source.camera)
+        self.repeats_after, self.timed = source.repeats_after, source.timed
         self._each_differs = bool(effects.image) or effects.pose_varies
         self.contents = None if self._each_differs else source.contents
         self._effects, self._codec = effects, codec

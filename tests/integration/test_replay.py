@@ -144,6 +144,16 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (None, 0)
 
 
+def test_cameras_that_are_not_replayed_are_not_waited_for(tmp_path):
+    shot, writer = depth_camera(0, 1).capture(0), SessionWriter(tmp_path / "a.mcap", {})
+    for name, at_ns in (("early", 1), ("cam01", 10**12)):
+        frame = Frame(name, "s", 0, at_ns, shot.pose, shot.intrinsics, "jpeg", shot.payload)
+        writer.frame(to_request(frame), at_ns)
+    writer.close({})
+    scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
+    assert camera_of(scenario).schedule(7).due_ns(0) == 7
+
+
 def test_a_recorded_run_replays_with_its_depth(tmp_path):
     """As it came, also where it belongs to another instant; what shows a held-out camera sends none."""
     sent = recorded(depth_camera(2, 4, after_image_ns=-40_000_000), tmp_path / "a.mcap", STAMPS)

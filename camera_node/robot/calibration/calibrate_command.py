@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError
+from camera_node.robot.calibration import DEFAULT_METHOD, CalibrationError, require_one_input
 from camera_node.robot.calibration.rig import rig_command
 
 EXAMPLES = """examples:
@@ -121,19 +121,8 @@ def run(args: argparse.Namespace) -> int:
         raise CalibrationError(str(error)) from None
 
 
-def _require_one_input(args: argparse.Namespace) -> None:
-    """Raise CalibrationError unless one input is given, and only options that it uses."""
-    given = [name for name in _INPUTS if getattr(args, name) is not None]
-    if len(given) != 1:
-        raise CalibrationError(f"expected one of {', '.join(_INPUTS.values())}")
-    for option, inputs in _GOES_WITH.items():
-        if getattr(args, option) is not None and given[0] not in inputs:
-            names = " or ".join(_INPUTS[name] for name in inputs)
-            raise CalibrationError(f"--{option}: goes with {names}, not with {_INPUTS[given[0]]}")
-
-
 def _hand_eye(args: argparse.Namespace) -> int:
-    _require_one_input(args)
+    require_one_input(args, _INPUTS, _GOES_WITH)
     from camera_node.robot.calibration.hand_eye.calibrate import ALL_METHODS, calibrate
     from camera_node.robot.calibration.targets import parse_target
 
@@ -203,7 +192,8 @@ def _target(args: argparse.Namespace) -> int:
     image = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
     # Detectors need a white border.
     border = max(8, width // 10)
-    if not cv2.imwrite(str(args.out), np.pad(image, border, constant_values=255)):
+    out = str(args.out)
+    if not (cv2.haveImageWriter(out) and cv2.imwrite(out, np.pad(image, border, constant_values=255))):
         raise CalibrationError(f"--out: {args.out} cannot be written (does its folder exist? .png?)")
     print(
         f"{args.out}: print it at {args.dpi:g} dpi without scaling; without its white border it must measure "

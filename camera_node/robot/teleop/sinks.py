@@ -24,7 +24,7 @@ class TrajectoryFile:
 
     def __init__(self, path: Path, arm: ArmModel) -> None:
         self._arm = arm
-        self._file = path.open("w", encoding="ascii")
+        self._file = path.open("w", encoding="ascii", buffering=1)  # a full disk is told by ``send``
         self._file.write(HEADER + "\n")
 
     def send(self, t_s: float, command: Command) -> None:
@@ -34,7 +34,8 @@ class TrajectoryFile:
         self._file.write(f"{t_s:.4f},{numbers},{command.state}\n")
 
     def close(self) -> None:
-        self._file.close()
+        with contextlib.suppress(OSError):  # of the line that ``send`` could not write
+            self._file.close()
 
 
 class ServoSink:

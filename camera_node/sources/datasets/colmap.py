@@ -146,7 +146,7 @@ def _text(file: Path) -> tuple[dict[int, Lens], list[_Image]]:
             raise DatasetError(
                 f"{file.with_stem('images')}:{number}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME"
             ) from None
-        if next(lines, None) is None:
+        if len(next(lines, (0, "missing"))[1].split()) % 3:  # two coordinates and the number of a point each
             raise DatasetError(f"{file.with_stem('images')}:{number}: the line of {words[9]}'s points is missing: cut?")
     return lenses, images
 

@@ -79,13 +79,17 @@ def open_recorded(
             f"{path}: has masks of pixels that must not be learned from, which a stream cannot carry: use edge-server "
             "fit, or leave the masks out"
         )
+    if wrong := [name for name in config.assignment.values() if name not in found.cameras]:
+        there = ", ".join(found.cameras) or "none that has a name"
+        raise ScenarioError(f"{scenario.path}: source.assignment: the data has no camera {wrong[0]!r} (it has {there})")
     path_of_one = len(scenario.cameras) == 1 == len(found.cameras) and all(image.time_s is not None for image in found)
     if found.moving or found.per_camera or path_of_one:
         names = {cameras[0]: found.cameras[0]} if path_of_one else {}
         names = names or assign_cameras(scenario, config.assignment, cameras, found.cameras)
-        shown = {camera: found.of(name) for camera, name in names.items()}
+        shown = {camera: _shown(found, name, camera in scenario.held_out) for camera, name in names.items()}
         recorded = {camera: _recorded_fps(found, shown[camera], path) for camera in cameras}
-        timeline = Timeline.of(found, path)
+        used = [config.assignment.get(camera, camera) for camera in scenario.cameras]
+        timeline = Timeline.of(found, found.cameras if path_of_one else used, path)
         order = {camera: timeline.nearest(images) for camera, images in shown.items()}
     else:
         own = [i for i, image in enumerate(found) if image.name in found.held_out]
@@ -105,13 +109,21 @@ def open_recorded(
                 f"{shown[camera][0].camera}"
             )
         shots = order.get(camera, range(len(shown[camera])))
-        steps_per_s = timeline.fps if camera in order else fps
-        playback = Playback(len(shots), rate(config.fps) if config.fps else fps, steps_per_s)
+        ticks_per_s = rate(config.fps) if config.fps else fps
+        # Photos have no rate of their own: each tick shows the next one.
+        playback = Playback(len(shots), ticks_per_s, timeline.fps if timeline.count else ticks_per_s)
         if scenario.held_out_every:
             shots = [shots[n] for n in playback.whole_groups(scenario.held_out_every)]
             playback = Playback(len(shots), playback.fps, playback.fps)
         sources[camera] = ImageSource(camera, shown[camera], shots, playback, config.codec, poses.get(camera))
     return sources
+
+
+def _shown(dataset: Dataset, name: str, held_out: bool) -> tuple[PosedImage, ...]:
+    """The images of a camera of a recording; of one that is trained on without the data set's own test images, unless
+    it has no others."""
+    images = dataset.of(name)
+    return tuple(image for image in images if held_out or image.name not in dataset.held_out) or images
 
 
 def split_photos(
@@ -143,9 +155,10 @@ class Timeline:
     fps: Fraction
 
     @staticmethod
-    def of(dataset: Dataset, path: Path) -> Timeline:
-        """From the first instant to the last that all cameras have, at the fastest one's rate. Raises DatasetError."""
-        cameras = [dataset.of(camera) for camera in dataset.cameras]
+    def of(dataset: Dataset, used: Sequence[str], path: Path) -> Timeline:
+        """From the first instant to the last that all cameras in use have, at the fastest one's rate. Raises
+        DatasetError."""
+        cameras = [dataset.of(camera) for camera in dataset.cameras if camera in used]
         fps = max(_recorded_fps(dataset, images, path) for images in cameras)
         times = [(images[0].time_s, images[-1].time_s) for images in cameras if len(images) > 1]
         known = [(first, last) for first, last in times if first is not None and last is not None]

@@ -179,7 +179,10 @@ def _cameras(frames: Sequence[dict[str, Any]], where: str) -> tuple[list[str], l
     shared, every = set.intersection(*instants.values()), set.union(*instants.values())
     once = Counter(zip(folders, map(repr, times))).most_common(1)[0][1] == 1
     if len(instants) > 1 and once and 2 * len(shared) >= len(every):
-        return [folder.rpartition("/")[2] for folder in folders], []
+        # What tells them apart: cam00 of images/cam00, and of cam00/images.
+        parts = [set(part) for part in zip(*(folder.split("/")[::-1] for folder in instants))]
+        k = next((k for k, part in enumerate(parts) if len(part) == len(instants)), None)
+        return [folder if k is None else folder.split("/")[-1 - k] for folder in folders], []
     alone = max(Counter(map(repr, times)).values()) == 1
     if alone and not all(0 <= _number(frame, "time", where) <= 1 for frame in frames):
         return named, [

@@ -39,6 +39,7 @@ class NoisySensor:
     def apply(self, image: Image, index: int, t_s: float = 0.0) -> Image:
         noise = frame_rng(self._key, index).standard_normal(image.shape, dtype=np.float32)
         noise *= self._sigma[image]
+        noise[..., 3:] = 0.0  # transparency is measured by no sensor
         noise += image
         np.rint(noise, out=noise)
         return np.clip(noise, 0.0, 255.0, out=noise).astype(np.uint8)

@@ -289,5 +289,7 @@ def test_a_recording_is_read_as_it_is_streamed(tmp_path):
     data = {"fl_x": focal_px, "w": 80, "h": 60, "frames": frames}
     (tmp_path / "transforms.json").write_text(json.dumps(data))
     cameras = {"ids": ["hand", "kept"], "held_out": ["kept"], "held_out_every": 8}
-    found = parse({"cameras": cameras, "source": {"kind": "transforms", "data": str(tmp_path)}}, tmp_path / "s.yaml")
-    refused(ValueError, "ms late", pose_check.check, found, source_config(found), None)
+    for fps in (1.0 / PERIOD_S, 2.0 / PERIOD_S):  # at twice the recording's rate it shows each image twice
+        source = {"kind": "transforms", "data": str(tmp_path), "fps": fps}
+        found = parse({"cameras": cameras, "source": source}, tmp_path / "s.yaml")
+        refused(ValueError, "100 ms late", pose_check.check, found, source_config(found), None)

@@ -2,12 +2,14 @@
 
 import os
 import threading
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from camera_node.pose import tracker
 from camera_node.pose.pairing import PoseGapError, SampleBuffer, interpolate_joints
 from camera_node.pose.providers import read_tum
 from camera_node.pose.tracker import TrackerPoses
@@ -132,6 +134,16 @@ def test_a_file_is_followed_from_before_it_is_there_to_its_next_beginning(follow
         _written(followed.path, _line(k) * (15 + k), "r+")
         assert _x(followed, k) == k
     assert followed.refused == 0
+
+
+def test_of_a_long_file_that_is_written_anew_with_each_pose_what_is_new_is_read(followed, monkeypatch):
+    read, other = MagicMock(side_effect=tracker.read_sample), followed.path.with_suffix(".new")
+    monkeypatch.setattr(tracker, "read_sample", read)
+    for count in (5000, 5001):
+        _written(other, "".join(map(_line, range(count))))
+        os.replace(other, followed.path)
+        assert _x(followed, count - 1) == count - 1
+    assert read.call_count < 200 and followed.refused == 0
 
 
 def test_a_frame_waits_for_the_pose_that_is_computed_after_it(followed):

@@ -38,6 +38,8 @@ def test_a_recording_is_assigned_by_name(tmp_path):
         (3, {"cam01": "cam00"}, "more than one camera shows cam00"),
     ):
         refused(ScenarioError, message, opened, photo_scenario(data, count, assignment=assignment))
+    photos = photo_scenario(write_photos(tmp_path / "photos", 9), assignment={"cam01": "left"})
+    refused(ScenarioError, "the data has no camera 'left' .it has none that has a name", opened, photos)
 
 
 @pytest.mark.parametrize(("fps", "time_unit_s"), [(0, 1.0), (1e9, 1.0), (None, 1e308), (None, 1e-320)])
@@ -62,10 +64,11 @@ def test_a_jpeg_of_the_right_size_is_sent_as_it_lies_unless_it_is_cut(tmp_path):
 
 
 def test_a_timeline_holds_what_all_cameras_have_at_the_fastest_ones_rate():
-    times = {"fast": [0.2, 0.3, 0.4, 0.6, 0.7, 0.8], "slow": [0.0, 0.2, 0.4, 0.6], "once": [5.0]}
+    times = {"fast": [0.2, 0.3, 0.4, 0.6, 0.7, 0.8], "slow": [0.0, 0.2, 0.4, 0.6], "once": [5.0], "unused": [8.0, 9.0]}
     rows, lens = [(camera, t_s) for camera in times for t_s in times[camera]], Pinhole(8, 8, 8, 8, 4, 4)
     images = (PosedImage(f"{camera}{t_s}", camera, t_s, np.eye(4), lens, lambda: None) for camera, t_s in rows)
-    assert Timeline.of(Dataset(tuple(images)), Path("set")) == Timeline(0.2, 5, Fraction(10))
+    found = Timeline.of(Dataset(tuple(images)), ["fast", "slow", "once", "unknown"], Path("set"))
+    assert found == Timeline(0.2, 5, Fraction(10))
 
 
 WORLD = {"kind": "world", "width": 16, "height": 12, "fps": 10, "carried": ["hand"], "params": {"people": 0}}
@@ -189,6 +192,7 @@ def test_a_depth_sensor_measures_with_every_camera_but_the_held_out_one_and_chan
 
 def test_a_bumped_camera_shows_another_view_from_then_on_and_reports_its_old_pose():
     bump = {"at_s": 1.0, "pitch_deg": 1.0, "cameras": ["cam01"]}
+    refused(ScenarioError, "effects.bump.cameras: 'cam1' is not one", cameras, {"bump": {**bump, "cameras": ["cam1"]}})
     found, plain = cameras({"bump": bump, "depth_sensor": {}}), cameras({"depth_sensor": {}})
 
     def made(camera: Camera, tick: int) -> tuple[Any, ...]:
@@ -225,6 +229,7 @@ def test_recordings_stand_where_they_stood_and_are_sent_as_they_lie_with_a_wrong
             build_cameras(scenario, source_config(scenario), scenario.cameras)
     scenario = photo_scenario(data, cameras=3, fps=5, effects={"pose_noise": {}})
     truth, wrong = build_cameras(scenario, source_config(scenario), ["cam00", "cam01"])
+    assert (wrong.source.repeats_after, wrong.source.timed) == (20, False), "as of the eleven photos without errors"
     shot = wrong.capture(1)
     np.testing.assert_array_equal(payload.decode(shot.payload, "png", 32, 24), picture(3)[..., ::-1])
     assert not np.allclose(shot.pose.matrix(), pose_of(3), atol=1e-6)

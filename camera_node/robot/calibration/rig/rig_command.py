@@ -9,7 +9,7 @@ import sys
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from camera_node.robot.calibration import CalibrationError
+from camera_node.robot.calibration import CalibrationError, require_one_input
 
 DESCRIPTION = """Estimates lenses and poses of cameras that stand still, from pictures of one target that somebody moves
 about and holds still: ten to twenty times where at least two cameras see it, and, unless --lens gives the lenses, some
@@ -23,6 +23,11 @@ input, one of:
   --colmap MODEL     a COLMAP model that has images of the cameras, named like them (cam00.jpg or cam00/...), scaled by
                      --length: the distance between two of the cameras
 """
+
+# Each input as its help names it, and option -> inputs that use it. With another input it is an error.
+_INPUTS = {"folder": "FOLDER", "live": "--live SCENARIO", "colmap": "--colmap MODEL"}
+_SEEN = ("folder", "live")
+_GOES_WITH = {"board": _SEEN, "lens": _SEEN, "origin": _SEEN, "length": ("colmap",), "seconds": ("live",)}
 
 
 def add_arguments(parser: argparse.ArgumentParser, board: str) -> None:
@@ -42,14 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser, board: str) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Calibrate, print, write. Raises CalibrationError."""
-    given = [name for name in ("folder", "live", "colmap") if getattr(args, name) is not None]
-    if len(given) != 1:
-        raise CalibrationError("expected one of FOLDER, --live SCENARIO, --colmap MODEL")
-    if args.colmap is not None:
+    if require_one_input(args, _INPUTS, _GOES_WITH) == "colmap":
         if args.length is None:
             raise CalibrationError("--length CAM CAM METERS: a COLMAP model has no scale; measure between two lenses")
         show(args, *scaled_model(args.colmap, *args.length))
         return 0
+    if args.seconds is not None and not args.seconds > 0:
+        raise CalibrationError("--seconds: expected a positive number")
     if args.board is None:
         raise CalibrationError("--board SPEC: say what the target is")
     found = _from_target(args)

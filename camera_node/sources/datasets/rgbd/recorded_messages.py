@@ -288,10 +288,10 @@ def _posed(
             unposed += 1
             continue
         lens = camera.lens_of(topic)
-        read, depth = partial(_read_image, messages, topic, log_ns, lens, options), None
+        read, depth = partial(_read_image, messages, (name, t_ns, topic, log_ns), lens, options), None
         near = _nearest(camera.depths, t_ns)
         if near is not None and abs(near[0] - t_ns) <= RECORDING_DEPTH_NEAR_NS:
-            depth = partial(_read_depth, messages, *near[2:], lens, options, near[0] - t_ns)
+            depth = partial(_read_depth, messages, (name, near[0], *near[2:]), lens, options, near[0] - t_ns)
         t_s, small = (t_ns - start_ns) / 1e9, shrink(pinhole(lens), options.scale)
         yield PosedImage(f"{name}/{n:06d}", name, t_s, matrix, small, read, depth=depth)
     if unposed:
@@ -304,18 +304,23 @@ def _nearest(ordered: Sequence[tuple[int, int, str, int]], t_ns: int) -> tuple[i
     return min(ordered[max(0, after - 1) : after + 1], key=lambda message: abs(message[0] - t_ns), default=None)
 
 
-def _again(messages: Messages, topic: str, log_ns: int) -> Picture:
-    """The image at a topic and log time. Raises DatasetError."""
+_Place = tuple[str, int, str, int]  # frame and stamp of an image, topic and log time: several may have the same
+
+
+def _again(messages: Messages, place: _Place) -> Picture:
+    """The image at a place. Raises DatasetError."""
+    *which, topic, log_ns = place
     for _, _, record in messages.read(topic, log_ns):
-        if isinstance(record, Picture):
+        if isinstance(record, Picture) and [record.frame, record.stamp_ns] == which:
             return record
     raise DatasetError(f"{messages.where}: {topic}: the message at {log_ns} ns is not there any more")
 
 
-def _read_image(messages: Messages, topic: str, log_ns: int, lens: Lens, options: ImageOptions) -> Image:
-    picture, where = _again(messages, topic, log_ns), f"{messages.where}: {topic}"
+def _read_image(messages: Messages, place: _Place, lens: Lens, options: ImageOptions) -> Image:
+    picture, where = _again(messages, place), f"{messages.where}: {place[2]}"
     if picture.encoding == COMPRESSED:
-        image = _decoded(picture, cv2.IMREAD_COLOR, 0, where)[..., ::-1]
+        # As stored, whatever EXIF says of its orientation: the lens is of the stored pixels.
+        image = _decoded(picture, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION, 0, where)[..., ::-1]
     else:
         channels, conversion = _COLORS[picture.encoding]
         image = _pixels(picture, np.dtype(np.uint8), channels, where)
@@ -326,10 +331,8 @@ def _read_image(messages: Messages, topic: str, log_ns: int, lens: Lens, options
     return resize(undistort(lens, as_image(np.ascontiguousarray(image))), small.width, small.height)
 
 
-def _read_depth(
-    messages: Messages, topic: str, log_ns: int, lens: Lens, options: ImageOptions, after_ns: int
-) -> DepthImage:
-    picture, where = _again(messages, topic, log_ns), f"{messages.where}: {topic}"
+def _read_depth(messages: Messages, place: _Place, lens: Lens, options: ImageOptions, after_ns: int) -> DepthImage:
+    picture, where = _again(messages, place), f"{messages.where}: {place[2]}"
     if picture.encoding == COMPRESSED_DEPTH:
         values = _decoded(picture, cv2.IMREAD_UNCHANGED, _DEPTH_HEAD_BYTES, where)
         if values.dtype != np.uint16 or values.ndim != 2 or not picture.form.startswith("16UC1"):

@@ -246,6 +246,7 @@ def test_a_printed_target_measures_what_is_said(spec, size, tmp_path, capsys):
     assert pixels == pytest.approx(200 / 0.0254, rel=0.001)
     words = ["calibrate", "target", spec, "--out", file, "--dpi", "nan"]
     assert "--dpi: makes a picture nan pixels wide" in refusal(capsys, main, *words)
+    assert "cannot be written" in refusal(capsys, main, "calibrate", "target", spec, "--out", tmp_path / "board")
 
 
 FLANGES = np.array([se3(so3_exp([0.1 * k, 0.2, -0.3]), [0.1, 0.2 * k, 0.3]) for k in range(3)])

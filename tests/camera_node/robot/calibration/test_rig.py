@@ -237,6 +237,8 @@ def test_what_cannot_be_used_is_refused_in_one_line(tmp_path, capsys):
         ([tmp_path / "cam0", "--board", BOARD], "for each of at least two cameras, found 0"),
         ([tmp_path, "--board", BOARD], "cam0 never sees the target: charuco:8x5:60mm:45mm not found: no markers"),
         (["--live", "room", "--board", BOARD], "expected camera, oak or realsense"),
+        (["--live", "room", "--board", BOARD, "--seconds", "nan"], "--seconds: expected a positive number"),
+        (["--colmap", tmp_path, "--lens", "x"], "--lens: goes with FOLDER or --live SCENARIO, not with --colmap MODEL"),
     ):
         error = refusal(capsys, main, "calibrate", "rig", *words)
         assert error.startswith("camera-node: ") and message in error

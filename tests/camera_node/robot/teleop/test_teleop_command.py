@@ -24,6 +24,7 @@ from camera_node.robot.teleop.stylus import KeyboardStylus, NetworkStylus, open_
 from camera_node.robot.teleop.teleoperator import Command, Teleoperator
 from tests.camera_node.robot.arm.simulated import write_cell
 from tests.camera_node.robot.teleop.test_teleoperator import HOME, sample
+from tests.freshfield.test_ledger import no_file_longer_than
 from tests.support import free_port, refusal, refused, wait_until
 
 
@@ -64,6 +65,13 @@ def test_a_dry_run_writes_a_trajectory_within_its_limits(tmp_path, capsys):
     flange = np.array([[float(row[f"{axis}_m"]) for axis in "xyz"] for row in rows])
     assert np.ptp(flange[:, 1]) > 0.01
     assert np.allclose(flange[-1], UR3E.forward(joints[-1])[:3, 3], atol=1e-6)
+
+
+def test_a_trajectory_that_a_full_disk_cuts_is_said_in_one_line(tmp_path, capsys):
+    words = ["teleop", str(write_cell(tmp_path, "127.0.0.2")), "--stylus", f"network:{free_port()}", "--seconds", "0.2"]
+    with no_file_longer_than(1000):
+        assert main([*words, "--dry-run", str(tmp_path / "path.csv")]) == 1
+    assert "camera-node: [Errno 27] File too large" in capsys.readouterr().err
 
 
 def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):

@@ -197,6 +197,14 @@ def test_formats_are_recognized_and_streamed_at_their_pace(tmp_path, name):
         assert isinstance(shot.image, bytes) == (name != "dynerf"), "what is a JPEG already is sent as it is"
 
 
+def test_each_photo_of_a_tower_is_shown_at_any_rate(tmp_path):
+    SETS["eyeful"][0](tmp_path / "set")
+    source = {"kind": "eyeful", "data": "set", "fps": 5}
+    scenario = parse({"cameras": {"ids": ["10", "11"]}, "source": source}, tmp_path / "s.yaml")
+    shown = opened(scenario)["10"]
+    assert [shown.content(tick) for tick in range(shown.contents)] == [*range(shown.contents)]
+
+
 @pytest.mark.parametrize(
     "lens",
     [
@@ -362,6 +370,7 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
     "colmap text": [
         (replaced("sparse/0/cameras.txt", b"PINHOLE", b"OPENCV"), "OPENCV has 8 parameters, not 4"),
         (changed("sparse/0/images.txt", lambda d: d[:-1].rpartition(b"\n")[0]), "points is missing: cut"),
+        (changed("sparse/0/images.txt", lambda d: d.replace(b"\n\n", b"\n")), "points is missing: cut"),
     ],
     "colmap": [
         (changed("sparse/0/images.bin", lambda d: d + b"more"), "4 bytes follow its last"),

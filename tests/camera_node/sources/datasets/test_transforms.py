@@ -51,11 +51,22 @@ def test_extensions_and_sizes_may_be_left_out(tmp_path):
     assert dataset[1].read().shape == (24, 32, 3)
 
 
+def _camera_by_folder(data):
+    for frame in data["frames"]:
+        frame["file_path"] = f"{frame.pop('camera')}/{frame['file_path']}"
+
+
 def test_time_and_camera_make_a_recording_and_null_is_as_good_as_absent(tmp_path):
     file = write_photos(tmp_path, 4, cameras=3)
     expected = load_dataset(file)
     assert expected.moving and expected.cameras == ("cam00", "cam01", "cam02")
     assert [r.time_s for r in expected.of("cam01")] == [0.0, 0.1, 0.2, 0.3]
+    for name in expected.cameras:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "images").symlink_to("../images")
+    of_folders = load_dataset(edited(file, _camera_by_folder))
+    assert [r.camera for r in of_folders] == [r.camera for r in expected], "cam00/images is of cam00"
+    file = write_photos(tmp_path, 4, cameras=3)
     nulls = dict.fromkeys(("k1", "is_fisheye", "camera_label", "camera_angle_x", "mask_path"))
     edited(file, lambda d: [d.update(nulls), *(f.update(nulls, fl_x=None, timestep=3) for f in d["frames"])])
     found = load_dataset(file)
@@ -189,6 +200,9 @@ def test_a_split_of_the_datas_own(tmp_path):
     kept = opened(photo_scenario(file.parent))["cam00"]
     truth = {kept.read(k).image.tobytes() for k in range(kept.contents)}
     assert truth == {r.read().tobytes() for r in found if r.name in found.held_out}
+    file = edited(write_photos(tmp_path / "d", 5, cameras=2), test_filenames=[names[3]])
+    seen = opened(photo_scenario(file, 2, assignment={"cam00": "cam01", "cam01": "cam00"}))["cam01"]
+    assert [(seen.read(k).image == picture(n)[..., ::-1]).all() for k, n in enumerate((0, 1, 2, 4))] == [True] * 4
 
 
 def test_orientation_and_size_are_what_the_camera_says(tmp_path):

@@ -114,6 +114,7 @@ def test_sensor_noise_has_the_stated_variance_and_is_white(level):
     for end in (0, 255):
         out = start(SensorNoise(read_noise_counts=50.0)).apply(np.full((64, 64, 3), end, np.uint8), 0)
         assert out.dtype == np.uint8 and (out == end).mean() > 0.4  # clipped, not wrapped around
+    assert (noise.apply(np.full((9, 9, 4), 99, np.uint8), 0)[..., 3:] == 99).all(), "transparency is no color"
 
 
 def errors(poses: list[Pose]) -> np.ndarray:

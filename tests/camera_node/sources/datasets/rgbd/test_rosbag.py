@@ -11,6 +11,7 @@ from camera_node.sources.datasets.formats import open_dataset
 from edge_server.experiments.scenes.recorded import load_recorded
 from freshfield.geometry import Pose, look_at
 from tests.camera_node.sources.datasets.photos import fails, opened
+from tests.support import turned_jpeg
 
 mcap = pytest.importorskip("mcap_protobuf.writer", reason="needs the extra mcap")
 rosbag2 = pytest.importorskip("rosbags.rosbag2", reason="needs the extra ros")
@@ -85,14 +86,14 @@ def robot(frames: int = 3) -> list:
     return said
 
 
-def write(where: Path, said: list, storage: str = "MCAP") -> Path:
+def write(where: Path, said: list, storage: str = "MCAP", later_ns: int = 1) -> Path:
     """Write (topic, log time or 0: a little after the last, message)."""
     with rosbag2.Writer(where, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as bag:
         topics, last = {}, START_NS
         for topic, t_ns, message in sorted(said, key=lambda each: each[1] or last):
             if topic not in topics:
                 topics[topic] = bag.add_connection(topic, message.__msgtype__, typestore=STORE)
-            last = max(last + 1, t_ns + 5_000_000)
+            last = max(last + later_ns, (t_ns + 5_000_000) * later_ns)
             bag.write(topics[topic], last, STORE.serialize_cdr(message, message.__msgtype__))
     return where
 
@@ -130,6 +131,7 @@ def png(values: np.ndarray) -> bytes:
     return cv2.imencode(".png", values)[1].tobytes()
 
 
+JPEG = cv2.imencode(".jpg", PICTURE)[1].tobytes()
 BAYER = np.random.default_rng(3).integers(0, 256, (24, 32), dtype=np.uint8)
 
 
@@ -140,6 +142,7 @@ BAYER = np.random.default_rng(3).integers(0, 256, (24, 32), dtype=np.uint8)
         (image(START_NS, "mono8", PICTURE[..., 0]), PICTURE[..., [0, 0, 0]]),
         (image(START_NS, "bayer_rggb8", BAYER), cv2.cvtColor(BAYER, cv2.COLOR_BayerRGGB2RGB)),
         (compressed(START_NS, "rgb8; png compressed bgr8", png(PICTURE[..., ::-1])), PICTURE),
+        (compressed(START_NS, "jpeg", turned_jpeg(JPEG, 3)), cv2.imdecode(np.frombuffer(JPEG, np.uint8), 1)[..., ::-1]),
         (image(START_NS, "16UC1", MM.astype(">u2"), big=True), MM),
         (compressed(START_NS, "16UC1; compressedDepth png", bytes(12) + png(MM)), MM),
     ],
@@ -149,6 +152,12 @@ def test_encodings_of_images_and_of_depth(tmp_path, message, expected):
     bag = write(tmp_path / "run", [*robot(), *(pictures(1)[:1] if is_depth else []), ("/any", START_NS, message)])
     record = open_dataset(bag)[1][0]
     assert np.array_equal(record.depth().counts if is_depth else record.read(), expected)
+
+
+def test_images_of_a_topic_that_were_logged_at_the_same_time_are_told_apart(tmp_path):
+    second = [("/camera/image_raw", 1, image(START_NS + 10**8, "rgb8", PICTURE[::-1]))]
+    found = open_dataset(write(tmp_path / "run", robot() + pictures(1) + second, later_ns=0))[1]
+    assert [np.array_equal(each.read(), PICTURE[::-1]) for each in found] == [False, True]
 
 
 def test_of_several_topics_of_a_frame_one_is_taken_and_named(tmp_path):
