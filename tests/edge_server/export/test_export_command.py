@@ -15,7 +15,9 @@ from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export import ExportError
 from edge_server.export.camera_paths import lens, orbit, read_nerfstudio, vertical_fov_deg
+from edge_server.export.colmap import Cloud
 from edge_server.export.run_source import open_source
+from edge_server.export.viewed_field import ViewedField
 from edge_server.fields import Budget, Field, View, checkpoint
 from edge_server.fields.registry import make_field
 from freshfield.geometry import Pinhole, look_at
@@ -195,6 +197,16 @@ def test_a_path_that_cannot_be_flown_is_refused_by_key(tmp_path):
     for change in ({"camera_type": "fisheye"}, {"fps": 0}, *steps):
         path.write_text(json.dumps(nerfstudio(**change)))
         refused(ExportError, next(iter(change)), read_nerfstudio, path)
+
+
+def test_depth_is_seen_from_where_the_field_has_found_its_cameras(tmp_path, monkeypatch):
+    """Only there do photographs fit to it, and to each other."""
+    found, given = look_at((1.0, 2.0, 3.0), (0.0, 0.0, 0.0)), []
+    monkeypatch.setattr(ViewedField, "pose", lambda *_: found)
+    monkeypatch.setattr("edge_server.surface.reconstruct.make_depth_maps", lambda _, views, *rest: given.extend(views))
+    monkeypatch.setattr("edge_server.export.point_cloud.sparse_points", lambda *_: Cloud(*np.zeros((3, 1, 3))))
+    ViewedField("splat", make_field("splat", SMALL), tuple(tile())).export(tmp_path / "points.ply", "points")
+    assert len(given) == 8 and all(np.array_equal(view.camera_to_world, found) for view in given)
 
 
 def test_a_camera_is_rendered_with_its_own_lens(tmp_path):
