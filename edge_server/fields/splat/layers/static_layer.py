@@ -68,14 +68,16 @@ class StaticLayer:
         self.shown_after = tuned.SHOWN_AFTER  # steps
         self._better_than = 1.0  # mean squared error of what is shown meanwhile, of full scale
         self._error = 1.0  # that of the latest steps
-        self._learned: dict[str, tuple[NDArray, NDArray]] = {}  # camera -> plate, known: as learned
+        # Camera -> plate, known: as learned, in that order. None: a plate that is no longer the camera's.
+        self._learned: dict[str, tuple[NDArray | None, NDArray]] = {}
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
     def forget_camera(self, camera: str) -> None:
         """Forget what a camera's plate was when it was learned, and renderings from its place."""
         self.stop()
         self.rendered.pop(camera, None)
-        self._learned.pop(camera, None)
+        if camera in self._learned:
+            self._learned[camera] = (None, self._learned[camera][1])
 
     def _begin_rounds(self, wanted: int, rate: float) -> None:
         self.rounds, self._rounds_wanted, self._rate = 0, wanted, rate
@@ -103,7 +105,7 @@ class StaticLayer:
 
     def learn(self, plates: Sequence[PlateImage]) -> None:
         """Take plates as what to learn. What is not known has no weight."""
-        views = []
+        views, self._learned = [], {}
         for view, color, known in plates:
             image = np.clip(color + 0.5, 0, 255).astype(np.uint8)
             views.append(replace(view, image=image, weight=known.astype(np.float32)))
@@ -127,10 +129,8 @@ class StaticLayer:
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
     def _changed_pixels(self, plate: PlateImage) -> int:
-        if plate.view.camera not in self._learned:
-            return int(np.count_nonzero(plate.known))
-        before, was_known = self._learned[plate.view.camera]
-        if was_known.shape != plate.known.shape:
+        before, was_known = self._learned.get(plate.view.camera, (None, plate.known))
+        if before is None or was_known.shape != plate.known.shape:
             return int(np.count_nonzero(plate.known))
         now_known, was_known = plate.known > 0, was_known > 0
         both = now_known & was_known
@@ -255,7 +255,8 @@ class StaticLayer:
         if self._mean is not None:
             mine["mean"] = self._mean.copy()
         for k, (camera, (plate, known)) in enumerate(self._learned.items()):
-            mine |= {f"learned_{k}.camera": np.array(camera), f"learned_{k}.plate": plate, f"learned_{k}.known": known}
+            mine |= {f"learned_{k}.camera": np.array(camera), f"learned_{k}.known": known}
+            mine |= {} if plate is None else {f"learned_{k}.plate": plate}
         return mine
 
     def load_state(self, state: Arrays) -> None:
@@ -265,8 +266,9 @@ class StaticLayer:
         self._learned = {}
         while (key := f"learned_{len(self._learned)}") + ".camera" in state:
             camera = str(state[f"{key}.camera"])
-            self._learned[camera] = (np.array(state[f"{key}.plate"]), np.array(state[f"{key}.known"]))
-        known = {camera: known.astype(np.float32) for camera, (_, known) in self._learned.items()}
+            plate = np.array(state[f"{key}.plate"]) if f"{key}.plate" in state else None
+            self._learned[camera] = (plate, np.array(state[f"{key}.known"]))
+        views = {view.camera: view for view in self.field.view_store.views}
+        known = {camera: known.astype(np.float32) for camera, (_, known) in self._learned.items() if camera in views}
         if known:
-            views = self.field.view_store.views
-            self.field.take_in([replace(v, weight=known[v.camera]) for v in views if v.camera in known])
+            self.field.take_in([replace(views[camera], weight=weight) for camera, weight in known.items()])

@@ -103,6 +103,19 @@ def test_a_state_continues_bit_for_bit_whatever_the_order_of_views_and_the_threa
         np.testing.assert_array_equal(still.render(ball.HELD.camera_to_world, ball.HELD.intrinsics).color, before)
 
 
+def test_a_state_goes_on_with_the_plates_that_were_learned_in_their_order() -> None:
+    """Whatever the order of the cameras' first views; also with that of a camera that was knocked since."""
+    field, other = ball.resumed_field(ball.known_plates(30)), LayeredField(ball.SMALL)
+    plates = [camera.plate_image(fine=False) for camera in field.cameras.values()]
+    field.static.begin(plates[::-1])
+    field.static.publish()
+    field.static.forget_camera(plates[0].view.camera)
+    other.load_state(field.state())
+    for each in (field, other):
+        each.static.train(StepBudget(Budget(steps=10)))
+    same_state(field, other)
+
+
 def test_it_tells_how_much_moves_before_each_camera_in_its_newest_frame() -> None:
     field = ball.resumed_field()
     newest = {o.camera: o.share for o in sorted(field.observations, key=lambda o: o.instant_s)}
