@@ -200,6 +200,7 @@ def test_points_know_who_sees_them():
     maps = ball_maps(12)
     found = sparse_points(maps, 1200)
     assert 1000 < len(found.points) <= 1200
+    assert len(sparse_points(maps, 7).points) == 7  # less than one of each map
     assert np.abs(np.linalg.norm(found.points, axis=1) - 0.1).max() < 1e-3
     top, bottom = found.points[:, 2] > 0.01, found.points[:, 2] < -0.01
     assert (found.color[top] == (200, 20, 20)).all() and (found.color[bottom] == 90).all()
