@@ -32,6 +32,8 @@ def test_what_is_saved_comes_back_and_a_failed_save_leaves_it(tmp_path: Path, mo
     np.testing.assert_array_equal(state["a"], STATE["a"])
     assert str(state["meta"]) == '{"x": 1}' and state["a"].dtype == np.float32
     assert [p.name for p in path.parent.iterdir()] == ["field.npz"]
+    (other := tmp_path / "edge.json").touch()
+    assert path.stat().st_mode == other.stat().st_mode  # who may read the rest of a run may read it
 
 
 def test_damage_is_told_clearly(tmp_path: Path) -> None:
