@@ -234,14 +234,15 @@ def on_sphere(
 
 
 def converging_point(origins: Array, directions: Array) -> Array | None:
-    """The point (3,) nearest to all rays (N, 3) in least squares; None where they run parallel or apart."""
+    """The point (3,) nearest to all rays (N, 3) in least squares; None where they run parallel or apart, or begin
+    there."""
     projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     total = projectors.sum(axis=0)
     if np.linalg.eigvalsh(total)[0] < 1e-3 * len(origins):
         return None
     point = np.linalg.solve(total, (projectors @ origins[:, :, None]).sum(axis=0)[:, 0])
     along = ((point - origins) * directions).sum(axis=1)
-    return point if np.median(along) > 0 else None
+    return point if np.median(along) > 1e-9 * np.abs(origins).max() else None
 
 
 # A shorter mean of unit vectors has no meaning: the cameras roll freely.

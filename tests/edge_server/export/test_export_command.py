@@ -138,11 +138,15 @@ def test_an_orbit_goes_round_or_stays_within_an_arc_as_cameras_stand_and_looks_a
 
 
 @pytest.mark.stability
-@pytest.mark.parametrize("which", ["outward", "one", "parallel"])
+@pytest.mark.parametrize("which", ["outward", "one", "parallel", "turning"])
 def test_cameras_that_have_nothing_in_common_still_give_a_path(which):
     chosen = views([0.0, 90.0, 180.0, 270.0], outward=True) if which == "outward" else views([20.0])
     if which == "parallel":
         poses = [chosen[0].camera_to_world + np.eye(4, k=3) * k for k in range(3)]
+        chosen = [replace(chosen[0], camera_to_world=pose) for pose in poses]
+    if which == "turning":  # on the spot
+        eye, ways = np.array([1.0, 2.0, 1.5]), np.radians([0.0, 30.0, 60.0])
+        poses = [look_at(eye, np.add(eye, (np.sin(way), -np.cos(way), 0.1))) for way in ways]
         chosen = [replace(chosen[0], camera_to_world=pose) for pose in poses]
     for step in orbit(chosen, 8, 50.0):
         assert np.isfinite(step.camera_to_world).all()
