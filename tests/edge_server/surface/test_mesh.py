@@ -10,6 +10,7 @@ from edge_server.surface import surface_constants as tuned
 from edge_server.surface import volume as volume_module
 from edge_server.surface.depth import DepthMap, depth_map
 from edge_server.surface.kernels.fuse import SIDE
+from edge_server.surface.kernels.lens import distort
 from edge_server.surface.mesh import extract_mesh, remove_degenerate, remove_small_components
 from edge_server.surface.reconstruct import mesh_from_depth_maps
 from edge_server.surface.sdf import fit_sdf
@@ -38,6 +39,16 @@ def test_the_kernel_fuses_as_the_equations_say_whatever_the_number_of_threads(ca
     assert (weight > 0).mean() > 0.3
     np.testing.assert_allclose(volume.blocks.weight[number, cell], weight, atol=2e-5)
     np.testing.assert_allclose(volume.blocks.distance[number, cell], distance, atol=1e-6)
+
+
+@pytest.mark.parametrize(("k1", "k2"), [(-0.3, 0.0), (-0.5, 0.1), (-0.3, 0.1), (0.2, -0.05), (-0.1, -0.05), (0.1, 0.1)])
+def test_no_two_places_before_a_lens_have_one_pixel(k1, k2):
+    """Or what lies beside the image would be carved away by those who do not see it."""
+    radii = np.linspace(0.0, 3.9, 300)
+    shown = np.array([distort(0.6 * r, 0.8 * r, k1, k2, 0.0, 0.0) for r in radii])
+    grows = np.logical_and.accumulate(1.0 + 3.0 * k1 * radii**2 + 5.0 * k2 * radii**4 > 0.0)
+    np.testing.assert_array_equal(np.isfinite(shown[:, 0]), grows)
+    assert (np.diff(shown[grows], axis=0) > 0.0).all()
 
 
 def test_too_fine_a_grid_says_what_would_do(monkeypatch):
