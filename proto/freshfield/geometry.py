@@ -386,6 +386,9 @@ def seen_from(camera: Pinhole, camera_to_world: ArrayLike, points: ArrayLike) ->
     at = camera.project(local)
     with np.errstate(invalid="ignore"):
         inside: NDArray[np.bool_] = np.all((at >= 0.0) & (at < (camera.width, camera.height)), axis=1)
+    if camera.distorted:  # far outside the field of view, its polynomial folds back into the image
+        ahead = (camera.rays(at[inside]) * local[inside]).sum(axis=1)
+        inside[inside] = ahead > 0.999 * np.linalg.norm(local[inside], axis=1)
     return local, at, inside
 
 

@@ -95,6 +95,12 @@ def test_look_at_looks_at(eye, target):
     refused(geometry.GeometryError, "", look_at, eye, eye)
 
 
+def test_a_lens_that_folds_back_does_not_see_what_is_aside():
+    lens, places = Pinhole(96, 72, 105.0, 105.0, 48.0, 36.0, (-0.3, 0.0, 0.0, 0.0)), [(-1.6, 0.0, 1.0), (0.2, 0.0, 1.0)]
+    _, at, inside = geometry.seen_from(lens, np.eye(4), places)
+    assert geometry.invertible(lens) and (at > 0).all() and inside.tolist() == [False, True]
+
+
 def test_rays_converge_where_least_squares_says():
     rng = np.random.default_rng(0)
     origins = rng.standard_normal((5, 3)) * 4.0
