@@ -12,6 +12,7 @@ from edge_server.fields.common.scene_box import converging_point
 from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from edge_server.fields.splat.layers.layer_constants import BRIGHT, DARK
+from freshfield.geometry import seen_from
 
 
 class Overlap(NamedTuple):
@@ -41,13 +42,10 @@ def overlaps(surfaces: Sequence[Surface]) -> list[Overlap]:
         for j, theirs in enumerate(surfaces):
             if i == j or not len(points):
                 continue
-            local = (points - theirs.pose[:3, 3]) @ theirs.pose[:3, :3]
             with np.errstate(invalid="ignore", over="ignore"):
-                x, y = np.nan_to_num(theirs.lens.project(local), nan=-1.0).T
-                inside = (x >= 0) & (y >= 0) & (x < theirs.lens.width) & (y < theirs.lens.height)
-            # A point far outside the field of view may be led back into the image by the lens polynomial.
+                local, at, inside = seen_from(theirs.lens, theirs.pose, points)
             inside &= local[:, 2] > tuned.NEAREST_M
-            x, y = x[inside].astype(int), y[inside].astype(int)
+            x, y = at[inside].astype(int).T
             use = theirs.known[y, x]
             x, y = x[use], y[use]
             if len(x):

@@ -123,6 +123,13 @@ def test_depth_of_a_wrong_scale_contradicts_the_others() -> None:
     assert contradicting([surface_of(CAMERAS[0], 10.0)]) == []  # alone, nothing tells
 
 
+def test_cameras_that_share_nothing_do_not_contradict_each_other_whatever_their_lens() -> None:
+    """Barrel distortion, continued, leads what is far aside back into the image."""
+    lens = Pinhole(160, 120, 150.0, 150.0, 80.0, 60.0, (-0.3, 0.0, 0.0, 0.0))
+    poses = [look_at((0.0, 0.0, 0.0), (np.cos(a), np.sin(a), 0.0)) for a in np.arange(6) * np.pi / 3.0]
+    assert contradicting([_wall(lens, pose, 2.0, 100.0) for pose in poses]) == []
+
+
 def test_exposures_follow_from_what_cameras_share() -> None:
     gains = np.array([0.8, 1.0, 1.1, 0.9])
     found = exposures([surface_of(view, gain=gain) for view, gain in zip(CAMERAS, gains)])
