@@ -43,6 +43,7 @@ from tests.support import refusal, refused
         ("viewpoints tile --budget many", "expected views"),
         ("viewpoints tile --budget 4 --selector ppo:none.npz", "not a viewpoint policy"),
         ("viewpoints tower --budget 4", "its cameras look outward"),
+        ("viewpoints tile --budget 1 --ask edges", "at least 2 views"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_one_line(words: str, said: str, tmp_path, capsys) -> None:
