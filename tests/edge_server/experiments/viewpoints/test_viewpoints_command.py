@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main
+from edge_server.experiments.viewpoints.reconstructions import varied_plan
 from edge_server.experiments.viewpoints.stage import open_stage
 from tests.edge_server.experiments.sets import write_photos
 
@@ -38,6 +39,10 @@ def test_an_arm_says_which_candidates_it_reaches():
     assert stage.take(int(np.flatnonzero(reached)[0])).image.shape == (16, 16, 3)
     far = np.linalg.norm(stage.candidates.poses[:, :3, 3] - stage.candidates.target, axis=1)
     np.testing.assert_allclose(far, 0.34)
+    few = stage.candidates.directions @ stage.candidates.directions[np.flatnonzero(reached)[0]] > 0.85
+    stage.candidates = stage.candidates.within(few)
+    assert 4 <= stage.candidates.reachable.sum() < 12
+    assert {len(varied_plan(stage, k, 4).order) for k in range(30)} == {4}
 
 
 @pytest.mark.slow
