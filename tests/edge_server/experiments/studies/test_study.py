@@ -194,11 +194,13 @@ def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
 
 
 def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
+    (tmp_path / "metrics-of-another-study.png").touch()
     assert main(["metrics", "--quick", "--seeds", "2", "--out", str(tmp_path)]) == 0
     page = (tmp_path / "metrics.md").read_text()
     assert page.startswith("# What the three metrics say") and "2 seeds a point" in page
     assert "`edge-server study metrics --quick --seeds 2`" in page
-    assert "false discovery rate 5 %" in page and "![" in page and "local ghosting" in page
+    assert "false discovery rate 5 %" in page and "](metrics.png)" in page and "local ghosting" in page
+    assert "metrics-of-another" not in page
     assert {row["case"] for row in csv.DictReader((tmp_path / "metrics.csv").open())} >= {"Gaussian blur"}
 
 
