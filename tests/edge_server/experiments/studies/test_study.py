@@ -15,7 +15,7 @@ import yaml
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
-from edge_server.experiments.studies import preferences, study, viewpoints
+from edge_server.experiments.studies import preferences, study, trial, viewpoints
 from edge_server.experiments.studies.depth_rate import DepthRun, run_with_depth
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
@@ -299,6 +299,11 @@ def test_a_scene_needs_a_held_out_camera(tmp_path: Path):
         scene.write_text(yaml.safe_dump({**RAW, "cameras": cameras}))
     assert checked(["mat"], request(tmp_path, scenes=(str(scenes[0]),))) == ["mat"]
     refused(StudyError, "no camera is held out", checked, ["mat"], request(tmp_path, scenes=(str(scenes[1]),)))
+    for data, here in (("none.yaml", True), ("nowhere", False)):  # beside the scenario, and not
+        scenes[0].write_text(yaml.safe_dump({**RAW, "source": {"kind": "transforms", "data": data}}))
+        asked = request(tmp_path, scenes=(str(scenes[0]), "tile"))
+        trial.recording.cache_clear()
+        assert trial.scenes_here(asked, ()) == [*asked.scenes[:here], "tile"]
 
 
 def test_selectors_stand_in_a_table_of_each_scene():
