@@ -299,6 +299,9 @@ def test_a_scene_needs_a_held_out_camera(tmp_path: Path):
         scene.write_text(yaml.safe_dump({**RAW, "cameras": cameras}))
     assert checked(["mat"], request(tmp_path, scenes=(str(scenes[0]),))) == ["mat"]
     refused(StudyError, "no camera is held out", checked, ["mat"], request(tmp_path, scenes=(str(scenes[1]),)))
+    (twin := tmp_path / "other" / "mine.yaml").parent.mkdir()
+    twin.write_text(scenes[0].read_text())
+    refused(StudyError, "two are called mine", checked, ["mat"], request(tmp_path, scenes=(str(scenes[0]), str(twin))))
     for data, here in (("none.yaml", True), ("nowhere", False)):  # beside the scenario, and not
         scenes[0].write_text(yaml.safe_dump({**RAW, "source": {"kind": "transforms", "data": data}}))
         asked = request(tmp_path, scenes=(str(scenes[0]), "tile"))
