@@ -24,7 +24,7 @@ from edge_server.experiments.studies.study import Study, StudyError, StudyReques
 from edge_server.experiments.studies.study_command import checked, main
 from edge_server.experiments.studies.study_constants import TRAININGS
 from edge_server.experiments.studies.trial import Trial, run_trial
-from edge_server.experiments.studies.verdicts import Claim, Finding, Verdict, judge
+from edge_server.experiments.studies.verdicts import Claim, Finding, Verdict, interior, judge, trend
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.rewards import f_w
 from tests.edge_server.experiments.rollouts.small import RAW
@@ -183,6 +183,11 @@ def test_verdicts_are_corrected_for_their_number():
     rows = [{"scene": k, "seed": 0, "reward": row} for k, row in enumerate([lucky, certain, *[equal] * 98])]
     assert [v.verdict for v in judged(better, SeedTable(rows))] == ["undecided", "holds", *["undecided"] * 98]
     assert [v.verdict for v in judged(better, SeedTable(rows[:2]))] == ["holds", "holds"]
+
+
+def test_a_curve_of_one_point_neither_rises_nor_has_an_inside():
+    table = SeedTable([{"images": 3.0, "seed": k, "psnr_db": 20.0 + k} for k in (0, 1)])
+    assert trend("images")(table, "psnr_db", {}) is interior("images")(table, "psnr_db", {}) is None
 
 
 def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
