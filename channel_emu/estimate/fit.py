@@ -114,6 +114,11 @@ def fit(
     if states not in ("1", "2", "auto"):
         raise RecordingError(f"--states {states}: expected 1, 2 or auto")
     recording = read_recording(path, discipline)
+    if recording.apart and states != "1":
+        raise RecordingError(
+            f"{path}: each camera has a chain of its own (scope per-camera), and in a fit they share one: --states 1, "
+            "or a file of the first line and those of one camera"
+        )
     delays_ms = _usable_delays_ms(recording)
     constant = float(delays_ms.std()) <= tuned.CONSTANT_CV * float(delays_ms.mean())
     sent = transmissions(recording)

@@ -77,6 +77,8 @@ class Recording:
     sampled: bool
     inferred: bool = False
     """Whether lost and dropped frames were told apart by what was in service, for lack of a column outcome."""
+    apart: bool = False
+    """Whether each camera has a chain of its own."""
 
     @property
     def frames(self) -> int:
@@ -125,7 +127,8 @@ def from_trace(path: Path, found: trace.Trace) -> Recording:
         outcome = np.array([r.outcome or "" for r in records])
         arrived = _ms([r.arrived_ns for r in records], first_ns) if sampled else offered
         cameras.append(Camera(name, offered, arrived, started, delay, outcome))
-    return Recording(path, cameras, found.config.discipline, sampled)
+    apart = found.config.chain is not None and found.config.chain.scope == "per-camera" and len(cameras) > 1
+    return Recording(path, cameras, found.config.discipline, sampled, apart=apart)
 
 
 def _ms(instants: Sequence[int | None], first_ns: int) -> NDArray[np.float64]:

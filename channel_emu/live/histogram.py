@@ -47,12 +47,14 @@ class Histogram:
         return self.sum_ms / self.count if self.count else None
 
     def percentile_ms(self, percent: float) -> float | None:
-        """Upper edge of the bin that holds the percentile, at most the maximum; None if empty."""
+        """Upper edge of the bin that holds the percentile, at most the maximum, which is that of the last bin; None if
+        empty."""
         if not self.count:
             return None
         rank = max(1, math.ceil(percent / 100 * self.count))
         index = int(np.searchsorted(np.cumsum(self._bins), rank))
-        return min(_FLOOR_MS * 10 ** (index / _PER_DECADE), self.max_ms)
+        last = index == len(self._bins) - 1
+        return self.max_ms if last else min(_FLOOR_MS * 10 ** (index / _PER_DECADE), self.max_ms)
 
     def summary(self) -> dict[str, float | None]:
         """Mean, percentiles and maximum in ms; None if empty."""
@@ -67,6 +69,7 @@ class Histogram:
             return [], []
         edges = np.linspace(0.0, top, count + 1)
         upper = _FLOOR_MS * 10.0 ** (np.arange(len(self._bins)) / _PER_DECADE)
+        upper[-1] = max(upper[-1], self.max_ms)
         # The cumulative count is known at the logarithmic edges; between them it is interpolated linearly.
         below = np.interp(edges, np.append(0.0, upper), np.append(0.0, np.cumsum(self._bins)))
         return edges.round(4).tolist(), np.diff(below).round(2).tolist()

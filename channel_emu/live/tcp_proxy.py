@@ -54,7 +54,10 @@ class Pipe(CallFlow):
         if kind is EventKind.DUPLICATED or (kind is EventKind.DELIVERED and not damaged):
             message.duplicated = False
             super().settle(message, kind)
-        elif not self._closed:
+            return
+        if damaged and self._link is not None:
+            self._link.record(message)  # as it is not handed on
+        if not self._closed:
             asyncio.get_running_loop().call_later(tuned.RESEND_AFTER_S, self._again, message)
 
     def _again(self, lost: Message) -> None:

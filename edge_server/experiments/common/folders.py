@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from camera_node.settings import find_data
 from edge_server.fidelity.lpips_weights import weights_folder
-from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario, ScenarioError
 
 
 @dataclass(frozen=True)
@@ -25,10 +27,15 @@ class Folders:
     def files_of(self, scenario: Scenario) -> list[Path]:
         """Existing files and folders that a scenario's results depend on: its data set, the files that its channel
         names, and the weights of LPIPS."""
-        data = scenario.source.get("data")
-        named = [] if data is None else [(self.data or Path()) / str(data)]
-        named += [scenario.path.parent / text for text in _texts(scenario.channel)]
-        return [path for path in (*named, self.lpips) if path is not None and path.exists()]
+        named = [scenario.path.parent / text for text in _texts(scenario.channel)]
+        return [path for path in (self.data_of(scenario), *named, self.lpips) if path is not None and path.exists()]
+
+    def data_of(self, scenario: Scenario) -> Path | None:
+        """A scenario's data set, beside it or in the data folder; None if it names none, or that is not there."""
+        names = [str(scenario.source[key]) for key in ("data", "file") if key in scenario.source]
+        with suppress(ScenarioError):
+            return find_data(names[0], scenario, self.data) if names else None
+        return None
 
 
 def folders_from(data: Path | None = None, lpips: Path | None = None) -> Folders:

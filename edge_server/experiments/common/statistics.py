@@ -161,12 +161,12 @@ def optimum(curve: _Curve, lower_is_better: bool = False, least: float = 0.0) ->
 
     curve: x -> seed -> value; seeds that lack a value at any x are left out.
     least: smallest difference that counts: a curve that saturates is best where it is first this near to its top.
-    Raises ValueError if no seed is left.
+    If no seed is left, everything is NaN.
     """
     xs = sorted(curve)
     seeds = _common_seeds([curve])
     if not seeds:
-        raise ValueError("no seed has a value at every point of the curve")
+        return Optimum(np.nan, np.nan, np.nan, interval([]), interval([]))
     table = _table(curve, seeds, lower_is_better)
     low, high = np.nan, np.nan
     if len(seeds) >= tuned.FEWEST_SEEDS:

@@ -155,8 +155,8 @@ class Fit(ViewedField):
         return report is not None
 
     def resume(self, folder: Path, until_s: float) -> None:
-        """Go on from what ``save`` wrote. Raises OptionError if there is nothing, or it has been fitted for
-        ``until_s`` seconds already."""
+        """Go on from what ``save`` wrote. Raises OptionError if there is nothing, it has been fitted for ``until_s``
+        seconds already, or other views were held out: it may have learned those that would be scored."""
         try:
             state, about = checkpoint.load(folder / "field")
             self.field.load_state(state)
@@ -165,6 +165,8 @@ class Fit(ViewedField):
             self._processes = _read_lines(folder / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
             raise OptionError(f"--resume: {folder} holds no fit to go on from: {error}") from None
+        if about.get("held_out", held_out := self._held_out()) != held_out:  # not said by earlier versions
+            raise OptionError(f"--resume: {folder} was fitted with other views held out: give the same --holdout")
         if self.spent_s > until_s - tuned.SHORTEST_SLICE_S:
             raise OptionError(
                 f"--resume: {folder} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
@@ -195,7 +197,8 @@ class Fit(ViewedField):
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        checkpoint.save(folder / "field", self.field.state(), {**self._about(), "steps": self.spent_steps})
+        about = {**self._about(), "steps": self.spent_steps, "held_out": self._held_out()}
+        checkpoint.save(folder / "field", self.field.state(), about)
         _write_lines(folder / "series.jsonl", self.rows)
         _write_lines(folder / "processes.jsonl", self._processes)
         write_json(folder / "edge.json", self._status())
@@ -204,6 +207,9 @@ class Fit(ViewedField):
             _write_png(folder / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
             _write_png(folder / "rendered.png", to_bytes(self._shown))
         return build_report(folder)
+
+    def _held_out(self) -> list[str]:
+        return [view.camera for view in self.data.held_out]
 
     def _about(self) -> dict[str, Any]:
         return {
@@ -225,7 +231,7 @@ class Fit(ViewedField):
                 "file": d.file.name,
                 "instant": d.instant,
                 "training": len(d.training),
-                "held_out": [v.camera for v in d.held_out],
+                "held_out": self._held_out(),
                 "missing": d.missing,
             },
             "baseline": mean_baselines(d.training, d.held_out, WHITE),

@@ -96,7 +96,8 @@ def load_recorded(
 def split(names: Sequence[str], holdout: str, own: Collection[str] = ()) -> tuple[list[str], list[str]]:
     """Split views into (training, held out) by ``holdout`` as in ``load_recorded``. own: names of the views
     that the data set itself holds out. Raises DatasetError."""
-    every = int(holdout) if holdout.strip().isdigit() else None
+    # 0012 is the name of an image, as 0012.jpg has it.
+    every = int(holdout) if holdout.strip().isdigit() and str(int(holdout)) == holdout.strip() else None
     if holdout.strip() == OWN_SPLIT:
         if not own:
             raise DatasetError(f"--holdout {OWN_SPLIT}: this data set does not say what it keeps for testing")

@@ -113,6 +113,7 @@ def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
     """Measure the cases without stored results, write OUT/NAME.csv, .md and figures, and return the verdicts.
     Raises StudyError."""
     request.out.mkdir(parents=True, exist_ok=True)
+    before = _figures(study, request)
     rows = study.measure(study.cases(request), request)
     write_csv(request.out / f"{study.name}.csv", rows)
     table = SeedTable(rows)
@@ -120,11 +121,19 @@ def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
         for draw in study.draw:
             draw(request, table)
     verdicts = judge(study.claims, study.metrics, study.panels, table)
-    write_text(request.out / f"{study.name}.md", markdown(study, request, table, verdicts))
+    drawn = sorted(name for name, _ in _figures(study, request) - before)
+    write_text(request.out / f"{study.name}.md", markdown(study, request, table, verdicts, drawn))
     return verdicts
 
 
-def markdown(study: Study, request: StudyRequest, table: SeedTable, verdicts: Sequence[Verdict]) -> str:
+def _figures(study: Study, request: StudyRequest) -> set[tuple[str, int]]:
+    """Names and times of the figures that are there: also of other scenes, and of a study with a longer name."""
+    return {(path.name, path.stat().st_mtime_ns) for path in request.out.glob(f"{study.name}*.png")}
+
+
+def markdown(
+    study: Study, request: StudyRequest, table: SeedTable, verdicts: Sequence[Verdict], figures: Sequence[str]
+) -> str:
     """The study as a page: how it was run, how often each claim holds, and folded, where."""
     of_claim = {v.claim: [w for w in verdicts if w.claim == v.claim] for v in verdicts}
     counted = [
@@ -132,7 +141,6 @@ def markdown(study: Study, request: StudyRequest, table: SeedTable, verdicts: Se
         for claim, of in of_claim.items()
     ]
     each = [[v.claim, v.about, v.verdict, v.found] for of in of_claim.values() for v in of]
-    figures = sorted(p.name for p in request.out.glob(f"{study.name}*.png"))
     seeds = len({row["seed"] for row in table.rows})
     at = f", commit {found}" if (found := commit()) else ""
     parts = [

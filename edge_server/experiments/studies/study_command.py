@@ -14,7 +14,7 @@ from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.engine import EngineError
 from edge_server.experiments.studies.registry import CAPTURING, CASED, DEPLOYED, LEARNING, ON_A_CHANNEL, STUDIES
 from edge_server.experiments.studies.study import StudyError, StudyRequest, run_study
-from edge_server.experiments.studies.trial import scenario_of
+from edge_server.experiments.studies.trial import scenario_of, scene_label
 from edge_server.experiments.training.trainer import TrainingError
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.viewpoints.candidates import ViewpointError
@@ -93,6 +93,9 @@ def checked(names: list[str], request: StudyRequest) -> list[str]:
             raise StudyError(f"--scene {scene}: its camera moves, which studies do not simulate")
         if not found.held_out and not set(names) <= set(CAPTURING):
             raise StudyError(f"--scene {scene}: no camera is held out (cameras.held_out), so that nothing is scored")
+    labels = [scene_label(scene) for scene in request.scenes or ()]
+    if twice := [label for label in labels if labels.count(label) > 1]:
+        raise StudyError(f"--scene: two are called {twice[0]} and would be taken for one: give the files other names")
     limits = [
         (request.scenes, {*STUDIES} - {*LEARNING}, "--scene: it has scenes of its own"),
         (request.ray, {*STUDIES} - {*CAPTURING}, "--ray: captures are made on this machine"),

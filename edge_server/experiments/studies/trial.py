@@ -152,16 +152,18 @@ def usual_trial(request: StudyRequest, scene: str, **more: Any) -> Trial:
 
 
 def scenes_here(request: StudyRequest, default: Sequence[str]) -> list[str]:
-    """The requested scenes, else ``default``, without recorded ones that are not in the data folder. Raises
-    StudyError if none is left."""
-    wanted, data = list(request.scenes or default), request.folders.data
+    """The requested scenes, else ``default``, without recorded ones whose data are neither beside them nor in the data
+    folder. Raises StudyError if none is left."""
+    wanted = list(request.scenes or default)
     found = []
     for scene in wanted:
         file = recording(scene)
-        if file is None or (data is not None and (data / file).exists()):
+        if file is None or request.folders.data_of(scenario_of(scene)) is not None:
             found.append(scene)
         else:
-            print(f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA)")
+            print(
+                f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA), nor beside it"
+            )
     if not found:
         raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
     return found

@@ -139,7 +139,7 @@ def interior(x: str) -> Statistic:
     def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
         _, lower, digits, _ = METRICS[metric]
         curve = table.curve(x, metric, **labels)
-        if not curve:
+        if len(curve) < 3:  # there is no inside
             return None
         best = optimum(curve, lower)
         text = (
@@ -175,7 +175,7 @@ def trend(x: str, rises: bool | None = None) -> Statistic:
     def found(table: SeedTable, metric: str, labels: Row) -> Finding | None:
         _, lower, digits, _ = METRICS[metric]
         curve = table.curve(x, metric, **labels)
-        if not curve:
+        if len(curve) < 2:  # of one point nothing can be said
             return None
         first, last = min(curve), max(curve)
         change = _gain(curve[last], curve[first], lower if rises is None else not rises)

@@ -32,7 +32,8 @@ def varied_plan(stage: Stage, k: int, views: int) -> Plan:
     if k % 3 == 1:
         angle = candidates.directions @ candidates.directions[rng.integers(len(candidates))]
         least = max(views, len(candidates) // 5)
-        nearest = np.argsort(-angle)[: int(rng.integers(least, max(least + 1, len(candidates) // 2)))]
+        usable = [i for i in np.argsort(-angle) if candidates.reachable[i]]
+        nearest = usable[: int(rng.integers(least, max(least + 1, len(candidates) // 2)))]
         candidates = candidates.within(np.isin(np.arange(len(candidates)), nearest))
     name = ("random", "random", "coverage")[k % 3]
     weight = float(rng.choice([0.0, 0.0, 0.5]))

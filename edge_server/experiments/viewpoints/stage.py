@@ -115,8 +115,9 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
     tests = half_hemisphere(target, radius_m, lens, HELD_OUT_VIEWPOINTS, offset=_BETWEEN, **sector)
     if path is not None:
         candidates = candidates.within(_arm_reaches(scenario, source, candidates))
-        # Viewpoints that the robot cannot reach are not scored either.
-        reached = tests.within(_arm_reaches(scenario, source, tests)).reachable
+        # Viewpoints that the robot cannot reach are not scored either, unless it reaches none.
+        reached = _arm_reaches(scenario, source, tests)
+        reached |= not reached.any()
         tests = Candidates(tests.poses[reached], lens, target, reached[reached])
     held_out = tuple(_render(scene, f"test{k:02d}", tests, k) for k in range(len(tests)))
     return Stage(scenario.name, candidates, held_out, known_options(scene, NEAR_OF_RADIUS * radius_m), scene=scene)

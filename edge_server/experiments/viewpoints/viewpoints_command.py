@@ -69,6 +69,10 @@ def _run(args: argparse.Namespace) -> None:
     if args.ask:
         args.out.mkdir(parents=True, exist_ok=True)
         views = min(budget.views or tuned.PLANNED_VIEWS, int(stage.candidates.reachable.sum()))
+        if views < 2:
+            raise OptionError(
+                f"--budget {args.budget}: --ask compares reconstructions from at least 2 views, got {views}"
+            )
         session, show = compare(
             stage,
             args.ask,

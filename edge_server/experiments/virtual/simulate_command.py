@@ -87,6 +87,8 @@ def _simulate(args: argparse.Namespace) -> None:
     config = read_config(scenario)
     deployment, missing = open_simulation(scenario, folders, lambda new: _settings(new, args), say, published)
     if args.out is not None:
+        for earlier in (args.out / "decisions").glob("*.npz"):  # of another run in this folder: explain would take them
+            earlier.unlink()
         decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
     watched = None
     if scenario.held_out_every:

@@ -99,6 +99,14 @@ def test_one_state_and_arrivals_that_sample_frames(tmp_path):
     assert found.channel["discipline"] == "newest-waits"
 
 
+def test_cameras_of_chains_of_their_own_are_not_fitted_as_one(tmp_path):
+    section = {**SLOW, "chain": {**RATES, "scope": "per-camera"}}
+    path = write_trace(tmp_path / "t.jsonl", section, 1, cameras=2, seconds=120)
+    refused(recordings.RecordingError, "a chain of its own", fit, path)
+    path.write_text("".join(line for line in path.read_text().splitlines(True) if '"cam01"' not in line))
+    check(fit(path), SLOW_TRUE)
+
+
 def test_rows_behind_a_waiting_place(tmp_path):
     """Transmission starts when the link becomes free; without a word of it the waiting would count as delay."""
     path = write_rows(tmp_path / "rows.csv", {**SLOW, "discipline": "newest-waits"}, 7)

@@ -53,8 +53,9 @@ def test_histogram_percentiles_are_within_a_bin(values, percent):
     counted = np.maximum(values, 0.0)
     exact = float(np.percentile(counted, percent, method="inverted_cdf"))
     assert found <= counted.max()
-    if exact < 9e4:
-        assert exact * 0.999999 <= found <= max(exact * 1.0234, 1e-4)
+    assert exact * 0.999999 <= found
+    if exact < 9e4:  # longer ones share a bin
+        assert found <= max(exact * 1.0234, 1e-4)
     assert histogram.count == len(values) and histogram.max_ms == counted.max()
     assert histogram.mean_ms == pytest.approx(counted.mean())
 

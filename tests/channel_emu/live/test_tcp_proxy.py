@@ -11,6 +11,7 @@ import pytest
 from channel_emu.live.live_emulator_constants import PIECE_BYTES, PIECES_BEHIND, RESEND_AFTER_S
 from channel_emu.live.proxy import ProxyOptions
 from channel_emu.live.tcp_proxy import TcpProxy
+from channel_emu.model import trace
 from channel_emu.model.settings import channel_from_mapping
 from freshfield.transport import TransportError
 from tests.support import free_port, until
@@ -54,8 +55,9 @@ async def through(proxy: TcpProxy, data: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("direction", "faults"), [("up", {}), ("both", {"loss": 0.2, "corruption": 0.2, "duplication": 0.5})]
 )
-async def test_everything_arrives_in_order(faults, direction):
-    async with echo({"service": "exp:2ms", "faults": faults}, direction=direction) as proxy:
+async def test_everything_arrives_in_order(faults, direction, tmp_path):
+    recorded = tmp_path / "trace.jsonl"
+    async with echo({"service": "exp:2ms", "faults": faults}, direction=direction, trace=recorded) as proxy:
         both = await asyncio.gather(through(proxy, DATA), through(proxy, DATA[::-1]))
         assert both == [DATA, DATA[::-1]]
         report = proxy.report()
@@ -63,6 +65,7 @@ async def test_everything_arrives_in_order(faults, direction):
         up = report.by_method["up bytes"]
         assert up.outcomes["forwarded"] >= 2 * 21 and up.in_flight == 0
         assert (up.dropped > 0) == ("loss" in faults)
+    assert len(trace.read(recorded).records) == report.offered
 
 
 async def test_each_piece_takes_a_service_time_and_a_lost_one_a_timeout():

@@ -43,6 +43,7 @@ from tests.support import refusal, refused
         ("viewpoints tile --budget many", "expected views"),
         ("viewpoints tile --budget 4 --selector ppo:none.npz", "not a viewpoint policy"),
         ("viewpoints tower --budget 4", "its cameras look outward"),
+        ("viewpoints tile --budget 1 --ask edges", "at least 2 views"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_one_line(words: str, said: str, tmp_path, capsys) -> None:
@@ -70,7 +71,8 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
     assert name == "mine" and found["service"] == f"trace:{tmp_path / 'delays.txt'}"
     (tmp_path / "whole.yaml").write_text(yaml.safe_dump({**RAW, "channel": section}))
     recorded = replace(load(str(tmp_path / "whole.yaml")), source={"data": "mine.yaml"})
-    assert Folders(tmp_path).files_of(recorded) == [tmp_path / "mine.yaml", tmp_path / "delays.txt"]
+    for data in (tmp_path, None):  # data beside the scenario need no folder
+        assert Folders(data).files_of(recorded) == [tmp_path / "mine.yaml", tmp_path / "delays.txt"]
     assert read_channel(str(tmp_path / "whole.yaml"))[0] == found
     (tmp_path / "wrong.yaml").write_text("{discipline: sometimes}")
     for text in (str(tmp_path / "wrong.yaml"), str(tmp_path / "none.yaml"), "sms"):

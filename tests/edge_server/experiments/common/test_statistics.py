@@ -56,6 +56,8 @@ def test_a_best_point_is_measured_on_seeds_that_did_not_choose_it():
     found = optimum(curve)
     assert (found.over_first.mean, found.over_last.mean) == (-5.0, -5.0)
     assert at_its_best({}) == at_its_best({1.0: {0: None}}) == {}
+    gaps = optimum({1.0: {0: None, 1: 2.0}, 2.0: {0: 1.0, 1: None}})  # no seed has a value at both
+    assert math.isnan(gaps.x) and gaps.interior() is None
 
 
 def test_an_interval_over_runs_and_seeds_covers_what_it_says():

@@ -23,7 +23,9 @@ from tests.edge_server.experiments.sets import write_photos, write_recording
 from tests.support import refused
 
 
-@pytest.mark.parametrize(("holdout", "numbers"), [("4", (0, 4, 8)), ("001, ./images/003", (1, 3)), ("0", ())])
+@pytest.mark.parametrize(
+    ("holdout", "numbers"), [("4", (0, 4, 8)), ("001, ./images/003", (1, 3)), ("0", ()), ("001", (1,))]
+)
 def test_every_kth_view_or_named_ones_or_none_are_held_out(tmp_path, holdout, numbers):
     write_photos(tmp_path, 9)
     found = load_recorded(tmp_path, holdout)

@@ -15,7 +15,7 @@ import yaml
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
-from edge_server.experiments.studies import preferences, study, viewpoints
+from edge_server.experiments.studies import preferences, study, trial, viewpoints
 from edge_server.experiments.studies.depth_rate import DepthRun, run_with_depth
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
@@ -24,7 +24,7 @@ from edge_server.experiments.studies.study import Study, StudyError, StudyReques
 from edge_server.experiments.studies.study_command import checked, main
 from edge_server.experiments.studies.study_constants import TRAININGS
 from edge_server.experiments.studies.trial import Trial, run_trial
-from edge_server.experiments.studies.verdicts import Claim, Finding, Verdict, judge
+from edge_server.experiments.studies.verdicts import Claim, Finding, Verdict, interior, judge, trend
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.rewards import f_w
 from tests.edge_server.experiments.rollouts.small import RAW
@@ -185,6 +185,11 @@ def test_verdicts_are_corrected_for_their_number():
     assert [v.verdict for v in judged(better, SeedTable(rows[:2]))] == ["holds", "holds"]
 
 
+def test_a_curve_of_one_point_neither_rises_nor_has_an_inside():
+    table = SeedTable([{"images": 3.0, "seed": k, "psnr_db": 20.0 + k} for k in (0, 1)])
+    assert trend("images")(table, "psnr_db", {}) is interior("images")(table, "psnr_db", {}) is None
+
+
 def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
     sure, weak, below = Interval(1.0, 0.9, 1.1, 10), Interval(1.0, 0.1, 1.9, 10), Interval(-1.0, -1.9, -0.1, 10)
     assert Finding("", (sure, weak)).above(0.0) is True
@@ -194,11 +199,13 @@ def test_a_claim_of_several_differences_is_as_sure_as_its_weakest_part():
 
 
 def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
+    (tmp_path / "metrics-of-another-study.png").touch()
     assert main(["metrics", "--quick", "--seeds", "2", "--out", str(tmp_path)]) == 0
     page = (tmp_path / "metrics.md").read_text()
     assert page.startswith("# What the three metrics say") and "2 seeds a point" in page
     assert "`edge-server study metrics --quick --seeds 2`" in page
-    assert "false discovery rate 5 %" in page and "![" in page and "local ghosting" in page
+    assert "false discovery rate 5 %" in page and "](metrics.png)" in page and "local ghosting" in page
+    assert "metrics-of-another" not in page
     assert {row["case"] for row in csv.DictReader((tmp_path / "metrics.csv").open())} >= {"Gaussian blur"}
 
 
@@ -297,6 +304,14 @@ def test_a_scene_needs_a_held_out_camera(tmp_path: Path):
         scene.write_text(yaml.safe_dump({**RAW, "cameras": cameras}))
     assert checked(["mat"], request(tmp_path, scenes=(str(scenes[0]),))) == ["mat"]
     refused(StudyError, "no camera is held out", checked, ["mat"], request(tmp_path, scenes=(str(scenes[1]),)))
+    (twin := tmp_path / "other" / "mine.yaml").parent.mkdir()
+    twin.write_text(scenes[0].read_text())
+    refused(StudyError, "two are called mine", checked, ["mat"], request(tmp_path, scenes=(str(scenes[0]), str(twin))))
+    for data, here in (("none.yaml", True), ("nowhere", False)):  # beside the scenario, and not
+        scenes[0].write_text(yaml.safe_dump({**RAW, "source": {"kind": "transforms", "data": data}}))
+        asked = request(tmp_path, scenes=(str(scenes[0]), "tile"))
+        trial.recording.cache_clear()
+        assert trial.scenes_here(asked, ()) == [*asked.scenes[:here], "tile"]
 
 
 def test_selectors_stand_in_a_table_of_each_scene():

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main
+from edge_server.experiments.viewpoints.reconstructions import varied_plan
 from edge_server.experiments.viewpoints.stage import open_stage
 from tests.edge_server.experiments.sets import write_photos
 
@@ -31,13 +32,19 @@ def test_candidates_of_a_recording_are_its_training_views_and_transparent_ones_s
     assert (stage.background, stage.options) == (((1.0,) * 3, {"background": "white"}) if alpha else ((0.0,) * 3, {}))
 
 
-def test_an_arm_says_which_candidates_it_reaches():
+def test_an_arm_says_which_candidates_it_reaches(monkeypatch):
     stage = open_stage("cell", 40, 16)
     reached = stage.candidates.reachable
     assert 20 <= reached.sum() < 40 and 10 <= len(stage.held_out) <= 20
     assert stage.take(int(np.flatnonzero(reached)[0])).image.shape == (16, 16, 3)
     far = np.linalg.norm(stage.candidates.poses[:, :3, 3] - stage.candidates.target, axis=1)
     np.testing.assert_allclose(far, 0.34)
+    few = stage.candidates.directions @ stage.candidates.directions[np.flatnonzero(reached)[0]] > 0.85
+    stage.candidates = stage.candidates.within(few)
+    assert 4 <= stage.candidates.reachable.sum() < 12
+    assert {len(varied_plan(stage, k, 4).order) for k in range(30)} == {4}
+    monkeypatch.setattr(f"{open_stage.__module__}._arm_reaches", lambda *of: np.full(len(of[2]), len(of[2]) == 40))
+    assert len(open_stage("cell", 40, 16).held_out) == 20, "something is scored"
 
 
 @pytest.mark.slow
