@@ -135,9 +135,9 @@ class Optimum:
 
     x: where the mean is best; the smallest x where it is within the least difference of the best.
     low, high: ends of the 95 % interval of x by resampling seeds; NaN for fewer than ``FEWEST_SEEDS``.
-    over_first, over_last: how much better the best is than the two ends of the curve. Chosen on one half of
-        the seeds and measured on the other, and the other way round, because a maximum is biased upwards on
-        the seeds that chose it.
+    over_first, over_last: how much better the best point between them is than the two ends of the curve. Chosen on
+        one half of the seeds and measured on the other, and the other way round, because a maximum is biased upwards
+        on the seeds that chose it. An end is never chosen: less itself it would be 0 for certain.
     """
 
     x: float
@@ -172,7 +172,8 @@ def optimum(curve: _Curve, lower_is_better: bool = False, least: float = 0.0) ->
     if len(seeds) >= tuned.FEWEST_SEEDS:
         bests = np.array(xs)[_first_best(table[_picks(len(seeds))].mean(1), least)]
         low, high = np.percentile(bests, [2.5, 97.5], method="nearest")
-    over_first, over_last = (interval(_chosen(table) - table[:, end]) for end in (0, -1))
+    inner = table[:, 1:-1] if len(xs) > 2 else table
+    over_first, over_last = (interval(_chosen(inner) - table[:, end]) for end in (0, -1))
     return Optimum(float(xs[int(_first_best(table.mean(0), least))]), float(low), float(high), over_first, over_last)
 
 

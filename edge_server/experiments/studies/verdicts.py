@@ -143,8 +143,8 @@ def interior(x: str) -> Statistic:
             return None
         best = optimum(curve, lower)
         text = (
-            f"best at {best.x:g}{best.spread}, {best.over_first.text(digits)} better than the smallest and "
-            f"{best.over_last.text(digits)} than the largest."
+            f"best at {best.x:g}{best.spread}; inside {best.over_first.text(digits)} better than at the smallest and "
+            f"{best.over_last.text(digits)} than at the largest."
         )
         return Finding(text, (best.over_first, best.over_last))
 

@@ -45,6 +45,9 @@ def test_an_optimum_inside_is_found_and_one_at_the_end_is_not_called_inside():
     assert optimum(curve_of(lambda x: abs(math.log(x / 40.0))), lower_is_better=True).x == 40.0
     rising = optimum(curve_of(lambda x: math.log(x)))
     assert rising.x == 160.0 and rising.interior(0.1) is False
+    # Both halves of the seeds have their best at the end, by less than the seeds differ by.
+    by_chance = {1.0: [-9.0] * 4, 2.0: [-1.0, 2.8, 2.8, -1.0], 3.0: [1.0] * 4}
+    assert optimum({x: dict(enumerate(values)) for x, values in by_chance.items()}).interior() is None
 
 
 def test_a_best_point_is_measured_on_seeds_that_did_not_choose_it():
