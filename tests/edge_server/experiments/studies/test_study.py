@@ -105,7 +105,7 @@ def test_every_point_is_a_deployment_that_can_be_read(name: str, quick: bool, tm
 
 @pytest.mark.slow  # some seconds of fits
 def test_figure_6_3_is_made_of_ones_own_channel_and_scene(tmp_path: Path, capsys, monkeypatch):
-    monkeypatch.setattr("edge_server.experiments.studies.waiting_curves.QUICK_OMEGAS", (60.0, 120.0))
+    monkeypatch.setattr("edge_server.experiments.studies.waiting_curves.QUICK_OMEGAS", (60.0, 120.0, 240.0))
     scene, channel, out = tmp_path / "mine.yaml", tmp_path / "slow.yaml", tmp_path / "out"
     scene.write_text(yaml.safe_dump({**RAW, "name": "mine"}))
     channel.write_text("{service: 'det:40ms', discipline: drop-new}")
