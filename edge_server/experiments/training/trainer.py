@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common import tables
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.engine import Engine
@@ -61,9 +62,9 @@ class TrainingConfig:
 
     spec: Spec
     reward: Reward
-    episodes: int = 600
-    batch: int = 10
-    samples: int = 2
+    episodes: int = tuned.EPISODES
+    batch: int = tuned.EPISODES_A_BATCH
+    samples: int = tuned.ACTION_SAMPLES
     seed: int = 0
 
     def __post_init__(self) -> None:
