@@ -109,7 +109,6 @@ def _export(args: argparse.Namespace, files: dict[str, Path]) -> None:
     exporter = Exporter(
         source.name,
         source.field,
-        source.views,
         source.shots,
         count=args.count,
         mesh=settings,

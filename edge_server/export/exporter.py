@@ -52,8 +52,8 @@ def check(files: Mapping[str, Path], count: int = POINTS) -> None:
 class Exporter:
     """Writes one field.
 
-    name: of the representation. field, views: what is exported. shots: the views at their poses,
-        each under a file's name.
+    name: of the representation. field: what is exported. shots: its views at the poses that belong to it, each under a
+        file's name.
     count: number of points in points, colmap and transforms.
     mesh: settings of a mesh.
     say: gets a line for each file. progress: gets the stage and the share that is done.
@@ -63,7 +63,6 @@ class Exporter:
         self,
         name: str,
         field: Field,
-        views: Sequence[View],
         shots: Sequence[View],
         *,
         count: int = POINTS,
@@ -71,7 +70,8 @@ class Exporter:
         say: Callable[[str], None] = lambda line: None,
         progress: Callable[[str, float], None] = lambda stage, share: None,
     ) -> None:
-        self._name, self._field, self._views, self._shots = name, field, views, shots
+        self._name, self._field, self._shots = name, field, shots
+        self._views = shots  # of the depth maps
         self._count, self._settings = count, mesh or MeshSettings()
         self._say, self._progress = say, progress
 

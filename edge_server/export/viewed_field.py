@@ -106,7 +106,7 @@ class ViewedField:
         from edge_server.export.exporter import Exporter
 
         file = Path(file)
-        Exporter(self.name, self.field, self.views, self.shots).write(
+        Exporter(self.name, self.field, self.shots).write(
             {kind or ("mesh" if file.suffix.lower() == ".glb" else "splats"): file}
         )
 

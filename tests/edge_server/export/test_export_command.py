@@ -6,6 +6,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -15,9 +16,10 @@ from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.export import ExportError
 from edge_server.export.camera_paths import lens, orbit, read_nerfstudio, vertical_fov_deg
-from edge_server.export.run_source import open_source
+from edge_server.export.run_source import Source, open_source
 from edge_server.fields import Budget, Field, View, checkpoint
 from edge_server.fields.registry import make_field
+from edge_server.surface import SurfaceError, reconstruct
 from freshfield.geometry import Pinhole, look_at
 from freshfield_up.cli import main as freshfield
 from tests.support import refusal, refused
@@ -58,6 +60,17 @@ def test_everything_at_once(run, tmp_path, capsys):
         assert (tmp_path / name).stat().st_size > 100, name
     assert len(list((tmp_path / "colmap" / "images").glob("*.png"))) == 8
     assert "8 cameras" in said and "triangles" in said
+
+
+def test_depth_of_a_mesh_is_that_of_corrected_poses(run, tmp_path, monkeypatch, capsys):
+    moved = np.eye(4)
+    moved[:3, 3] = 0.03
+    monkeypatch.setattr(Source, "pose", lambda _, view: moved @ view.camera_to_world)
+    made = Mock(side_effect=SurfaceError("enough"))
+    monkeypatch.setattr(reconstruct, "make_depth_maps", made)
+    assert edge_server(["export", str(run), "--mesh", str(tmp_path / "m.ply")]) == 2
+    for view, given in zip(made.call_args.args[1], open_source(run, False).views, strict=True):
+        np.testing.assert_array_equal(view.camera_to_world, moved @ given.camera_to_world)
 
 
 @pytest.mark.parametrize(
