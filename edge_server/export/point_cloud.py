@@ -16,8 +16,8 @@ def sparse_points(maps: Sequence[DepthMap], count: int) -> Cloud:
     """Up to ``count`` surface points, sampled evenly from all maps with trust, and the maps that see each."""
     points, colors, source = [], [], []
     trusted = [(k, found) for k, found in enumerate(maps) if found.trust.any()]
-    share = count // max(len(trusted), 1)
-    for k, found in trusted:
+    for n, (k, found) in enumerate(trusted):
+        share = (n + 1) * count // len(trusted) - n * count // len(trusted)  # fewer points than maps are some, too
         at = np.flatnonzero(found.seen)
         at = at[np.linspace(0, len(at) - 1, min(share, len(at))).round().astype(np.int64)] if len(at) else at
         lens, pose = found.intrinsics, found.camera_to_world

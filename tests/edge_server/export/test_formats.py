@@ -208,6 +208,7 @@ def test_points_know_who_sees_them():
         front = found.points @ m.camera_to_world[:3, 3] > 0
         assert front[found.seen[:, k]].all()
     assert (found.seen.sum(axis=1) >= 2).mean() > 0.8
+    assert len(sparse_points(maps, 5).points) == 5, "of five of the twelve maps"
 
 
 def test_pictures_keep_their_own_names_and_these_are_safe_and_different():
