@@ -34,7 +34,7 @@ class OffsetEstimator:
     """NTP's estimate: the offset of the exchange with the smallest error bound among the last ``KEPT_OFFSETS``.
 
     The bound is half the round trip plus ``drift_ppm`` (parts per million) of the exchange's age, so the
-    estimate follows a drifting clock. Thread-safe.
+    estimate follows a drifting clock. An exchange that contradicts it ends those before. Thread-safe.
     """
 
     def __init__(self, drift_ppm: float = tuned.OFFSET_DRIFT_PPM) -> None:
@@ -54,7 +54,11 @@ class OffsetEstimator:
         offset = ((received_ns - sent_ns) + (replied_ns - returned_ns)) // 2
         if abs(offset) > _MAX_OFFSET_NS:
             return
+        known = self.estimate(returned_ns)
         with self._lock:
+            # Beyond both bounds: one of the clocks was set, or stood still while its machine was suspended.
+            if known is not None and abs(offset - known.offset_ns) > known.uncertainty_ns + round_trip // 2 + 1:
+                self._samples.clear()
             self._samples.append((returned_ns, offset, round_trip // 2))
 
     def estimate(self, now_ns: int) -> Offset | None:

@@ -39,6 +39,7 @@ TRACKER_LATE_S = 0.1
 # Bytes compared again later, and longest line that is kept: one has some 100.
 TRACKER_LINE_BYTES = 4096
 TRACKER_TAIL_BYTES = 65_536  # read at once, and of a longer file at first: more than KEPT_POSES_NS at 300 a second
+TRACKER_STEP_NS = 1_000_000  # by which two clocks of a machine differ at least where one of them stepped
 TRACKER_JOIN_S = 2.0  # for its thread to end
 # Absolute value of a time stamp in a file: the difference of two fits in 64 bits of nanoseconds. Counted from 1970 it
 # is the year 2115; larger ones have another unit.

@@ -26,7 +26,7 @@ def check(scenario: Scenario, config: RecordedConfig, data: Path | None) -> str:
     """What the poses of each training camera that moves are worth, in words; "" if none moves. Raises ValueError
     or OSError."""
     if scenario.held_out_every:  # whole paths, of which held-out captures are a part
-        scenario = replace(scenario, cameras=scenario.training, held_out=())
+        scenario = replace(scenario, cameras=scenario.training, held_out=(), held_out_every=1)
     said = []
     for camera, source in open_sources(scenario, config, scenario.training, data).items():
         images, poses, focal_px, period_ms = _captures(source, config.codec)

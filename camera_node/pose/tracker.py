@@ -1,7 +1,8 @@
 """Poses that a tracker (SLAM, motion capture) gives while the camera runs: lines of a TUM trajectory, appended to a
 file, or written to a named pipe.
 
-Times are seconds since 1970 (UTC), as ROS stamps and ``time.time()`` are, so that they fit the frames' stamps.
+Times are seconds since 1970 (UTC), as ROS stamps and ``time.time()`` are, so that they fit the frames' stamps. The
+frames' clock never steps: where the machine's does, or goes on while it is suspended, later poses are shifted as much.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from camera_node import node_constants as tuned
 from camera_node.pose.pairing import PoseGapError, SampleBuffer
 from camera_node.pose.providers import read_sample
 from camera_node.sources.datasets.records import DatasetError
+from freshfield.clock import Clock, SystemClock, WallClock
 from freshfield.geometry import Pose
 
 log = logging.getLogger("camera-node")
@@ -32,6 +34,9 @@ class TrackerPoses:
 
     def __init__(self, path: Path, interpolate: bool = True, max_gap_ns: int = 50_000_000) -> None:
         self.path, self.refused = path, 0
+        self._clock: Clock = WallClock()
+        self._system: Clock = SystemClock()
+        self._ahead_ns = 0
         self._samples = SampleBuffer[Pose](Pose.interpolate if interpolate else None, max_gap_ns)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._main, name=f"tracker {path.name}", daemon=True)
@@ -95,4 +100,12 @@ class TrackerPoses:
             if self.refused == 1:
                 log.warning("%s; lines that are no pose are left out", error)
             return True
-        return sample is None or self._samples.add(*sample)
+        return sample is None or self._samples.add(sample[0] + self._shift_ns(), sample[1])
+
+    def _shift_ns(self) -> int:
+        """The frames' clock minus the machine's, the same until one of them steps."""
+        least_ns = self._clock.now_ns()
+        system_ns, most_ns = self._system.now_ns(), self._clock.now_ns()
+        if not least_ns - tuned.TRACKER_STEP_NS <= system_ns + self._ahead_ns <= most_ns + tuned.TRACKER_STEP_NS:
+            self._ahead_ns = most_ns - system_ns
+        return self._ahead_ns

@@ -24,7 +24,14 @@ def trajectory_poses(
     found: dict[str, PoseProvider] = {}
     interpolated, max_gap_ns = config.pairing == "interpolated", round(config.max_gap_ms * 1e6)
     for camera in set(cameras) & set(config.files):
-        file = base / config.files[camera]
+        file, mount = base / config.files[camera], None
+        if config.hand_eye:
+            from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND, read_hand_eye
+
+            with errors_of(f"{where}.hand_eye"):
+                mount = read_hand_eye(base / config.hand_eye)
+                if mount.setup == EYE_TO_HAND:
+                    raise ValueError(f"{config.hand_eye} is {EYE_TO_HAND}: its camera stands still, nothing carries it")
         if live:
             from camera_node.pose.tracker import TrackerPoses
 
@@ -32,9 +39,6 @@ def trajectory_poses(
         else:
             with errors_of(f"{where}.files.{camera}"):
                 found[camera] = read_tum(file, interpolated, max_gap_ns, round(config.start_s * 1e9))
-        if config.hand_eye:
-            from camera_node.robot.arm.hand_eye_mount import read_hand_eye
-
-            with errors_of(f"{where}.hand_eye"):
-                found[camera] = read_hand_eye(base / config.hand_eye).camera_poses(found[camera])
+        if mount is not None:
+            found[camera] = mount.camera_poses(found[camera])
     return found

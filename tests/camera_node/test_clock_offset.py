@@ -50,6 +50,14 @@ def test_the_best_of_the_last_sixteen_exchanges_counts():
     assert offsets == [5] * 15 + [7]
 
 
+def test_a_clock_that_stood_still_ends_what_was_known_of_it():
+    """After a suspended machine wakes, the other clock is ahead by as long, however promptly it answered before."""
+    estimator, slept = OffsetEstimator(), 20 * 10**9
+    estimator.add(0, MS // 2, MS // 2, MS)
+    estimator.add(100 * MS, 102 * MS + slept, 102 * MS + slept, 104 * MS)
+    assert estimator.estimate(104 * MS).offset_ns == slept
+
+
 def test_impossible_exchanges_are_ignored():
     estimator = OffsetEstimator()
     estimator.add(0, 0, 10, 5)  # the answer took longer to make than the whole exchange

@@ -17,7 +17,7 @@ from edge_server.live.output.recorder import Recorder
 from freshfield import frame as wire
 from freshfield import payload
 from freshfield.depth import DepthImage
-from freshfield.session.bag_writer import BagWriter
+from freshfield.session.bag_writer import BagWriter, _measured
 from tests.edge_server.live.output.test_output import PUBLICATION
 from tests.freshfield.test_session import LENS, requests
 from tests.support import refused
@@ -77,6 +77,8 @@ def test_rosbags_reads_what_was_sent(tmp_path):
         assert moved.header.frame_id == "world"
     depth = found["/cam01/depth/image"][0][1]
     assert (depth.encoding, depth.header.frame_id) == ("16UC1", "cam01_depth")
+    of_realsense = DepthImage(np.ones((2, 3), np.uint16), float(np.float32(0.001)))
+    assert _measured(of_realsense)[0] == "16UC1"
     beside = next(transform for transform in transforms if transform.child_frame_id == "cam01_depth")
     assert (beside.header.frame_id, beside.transform.translation.x) == ("cam01", 0.05)
     assert json.loads(found["/decisions"][0][1].data)["number"] == PUBLICATION.number

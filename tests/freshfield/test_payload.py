@@ -194,3 +194,12 @@ def test_halving_keeps_the_picture(codec, size):
         if width % n == height % n == 0:
             mean = image.reshape(height // n, n, width // n, n, 3).mean(axis=(1, 3))
             assert np.abs(small - mean).max() < 6
+
+
+def test_halving_lets_no_color_of_transparent_pixels_bleed():
+    image = np.zeros((6, 5, 4), np.uint8)
+    image[:3, :3] = (220, 40, 90, 255)  # an edge within blocks of two
+    image[4, 4] = (10, 200, 30, 128)
+    small = decode(encode(image, "png"), "png", 5, 6, 1)
+    assert np.array_equal(small[1, 1], (220, 40, 90, 64)) and np.array_equal(small[0, 1], (220, 40, 90, 128))
+    assert np.array_equal(small[2, 2], (10, 200, 30, 64)) and not small[2, 0].any()

@@ -19,6 +19,7 @@ from camera_node.sources.datasets.records import Dataset, DatasetError, find_fil
 FORMATS = tuple(kind for kind, model in MODELS.items() if issubclass(model, RecordedConfig))
 
 
+_RECORDINGS = (".mcap", ".db3", ".bag")
 _VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 _OF_VIDEO = "a video and its trajectory are named in a scenario: freshfield scenario init mine.yaml --like video"
 
@@ -57,7 +58,7 @@ def recognize(file: Path) -> str:
     """
     if file.name == "metadata.json":
         return "record3d"
-    if file.suffix in (".mcap", ".db3", ".bag"):
+    if file.suffix in _RECORDINGS:
         return "foxglove" if file.suffix == ".mcap" else "rosbag"
     if file.suffix in (".bin", ".txt"):
         return {"rgb.txt": "tum", "frame-000000.pose.txt": "sevenscenes"}.get(file.name, "colmap")
@@ -70,11 +71,15 @@ def recognize(file: Path) -> str:
 
 
 def _candidates(path: Path, name: str | None = None) -> list[tuple[str, Path]]:
-    """Formats and describing files of what may be a data set, best first. name: the only format; None: any."""
+    """Formats and describing files of what may be a data set, best first. name: the only format; None: any. Raises
+    DatasetError for several recordings, each a file of its own."""
     if path.is_file():
         return [(name or recognize(path), path)]
     kinds = FORMATS if name is None else (name,)
-    return [(kind, file) for kind in kinds for file in find_files(path, reader(kind).FILES)]
+    found = [(kind, file) for kind in kinds for file in find_files(path, reader(kind).FILES)]
+    if len(found) > 1 and all(file.suffix in _RECORDINGS for _, file in found):
+        raise DatasetError(f"{path}: holds {', '.join(file.name for _, file in found)}: name the file itself")
+    return found
 
 
 def find_format(path: Path) -> str:

@@ -8,6 +8,7 @@ camera steps through its photos back and forth, like a moving camera.
 from __future__ import annotations
 
 import logging
+from bisect import bisect_left
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -113,7 +114,8 @@ def open_recorded(
         # Photos have no rate of their own: each tick shows the next one.
         playback = Playback(len(shots), ticks_per_s, timeline.fps if timeline.count else ticks_per_s)
         if scenario.held_out_every:
-            shots = [shots[n] for n in playback.whole_groups(scenario.held_out_every)]
+            every = scenario.held_out_every
+            shots = _apart([shots[n] for n in playback.whole_groups(every)], every)
             playback = Playback(len(shots), playback.fps, playback.fps)
         sources[camera] = ImageSource(camera, shown[camera], shots, playback, config.codec, poses.get(camera))
     return sources
@@ -124,6 +126,22 @@ def _shown(dataset: Dataset, name: str, held_out: bool) -> tuple[PosedImage, ...
     it has no others."""
     images = dataset.of(name)
     return tuple(image for image in images if held_out or image.name not in dataset.held_out) or images
+
+
+def _apart(shown: Sequence[int], every: int) -> list[int]:
+    """The images of captures, of which the first of ``every`` is held out, so that no other one shows its image: a rate
+    above the recording's repeats images, and so does a dropped frame. Those show the one before or after it. Raises
+    DatasetError where none is left for them."""
+    held = set(shown[::every])
+    own = sorted(set(shown) - held)
+    apart = list(shown)
+    for n, image in enumerate(shown):
+        if n % every and image in held:
+            if not own:
+                raise DatasetError(f"one of {every} captures is held out: no other has an image of its own: lower fps")
+            after = bisect_left(own, image)
+            apart[n] = own[min(after, len(own) - 1) if n % every <= every // 2 else max(0, after - 1)]
+    return apart
 
 
 def split_photos(

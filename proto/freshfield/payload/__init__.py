@@ -158,7 +158,14 @@ def _halved(image: NDArray[np.uint8], halvings: int) -> NDArray[np.uint8]:
     for _ in range(halvings):
         bottom, right = image.shape[0] % 2, image.shape[1] % 2
         even = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
-        image = np.asarray(cv2.resize(even, (even.shape[1] // 2, even.shape[0] // 2), interpolation=cv2.INTER_AREA))
+        half = even.shape[1] // 2, even.shape[0] // 2
+        small = np.asarray(cv2.resize(even, half, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        if image.shape[2] == 4:  # straight alpha: a mean of colors counts each as far as it is seen
+            blocks = even.reshape(small.shape[0], 2, small.shape[1], 2, 4).astype(np.float32)
+            alpha = blocks[..., 3:]
+            seen = (blocks[..., :3] * alpha).sum(axis=(1, 3)) / np.maximum(alpha.sum(axis=(1, 3)), 1.0)
+            small[..., :3] = np.rint(seen)
+        image = small
     return image
 
 

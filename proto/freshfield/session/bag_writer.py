@@ -14,6 +14,7 @@ A message's time in the bag is its arrival at the edge, its stamp the capture, b
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from contextlib import suppress
@@ -149,6 +150,6 @@ class BagWriter:
 
 def _measured(depth: DepthImage) -> tuple[str, np.ndarray]:
     """Encoding and values of a depth image in ROS's convention (REP 118)."""
-    if depth.meters_per_count == _MILLIMETER:
+    if math.isclose(depth.meters_per_count, _MILLIMETER, rel_tol=1e-6):  # librealsense tells it in 32 bits
         return "16UC1", depth.counts.astype("<u2")
     return "32FC1", np.where(depth.counts > 0, depth.meters(), np.nan).astype("<f4")

@@ -153,6 +153,15 @@ def test_a_frame_waits_for_the_pose_that_is_computed_after_it(followed):
     assert followed.at(START_NS + STEP_NS // 2)[0].translation_m[0] == pytest.approx(0.5)
 
 
+def test_poses_fit_frames_after_the_machine_was_suspended(followed):
+    """The frames' clock stands still meanwhile, that of the tracker's stamps does not."""
+    _written(followed.path, _line(0))
+    assert _x(followed, 0) == 0.0
+    followed._system = MagicMock(now_ns=lambda: followed._clock.now_ns() + 3000 * STEP_NS)
+    _written(followed.path, _line(3001) + _line(3002))
+    assert _x(followed, 1.5) == pytest.approx(3001.5, abs=0.1)
+
+
 def test_a_named_pipe_is_read_from_one_writer_after_the_other(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     poses = TrackerPoses(tmp_path / "pipe")

@@ -83,9 +83,9 @@ def cameras_of(found: Scenario, only: str = "") -> dict[str, Camera]:
     return {c.name: c for c in build_cameras(found, source_config(found), [only] if only else found.cameras)}
 
 
-@pytest.mark.parametrize(("fps", "count"), [(None, 33), (5, 60)])
-def test_no_frame_of_a_recording_is_both_held_out_and_trained_on_in_any_round(tmp_path, fps, count):
-    at_10 = [3.0 + k / 10 for k in range(count)]
+@pytest.mark.parametrize(("fps", "count", "lost"), [(None, 33, 99), (5, 60, 99), (20, 33, 99), (None, 33, 16)])
+def test_no_frame_of_a_recording_is_both_held_out_and_trained_on_in_any_round(tmp_path, fps, count, lost):
+    at_10 = [3.0 + (k + (k >= lost)) / 10 for k in range(count)]
     data = edited(write_photos(tmp_path, count), lambda d: [f.update(time=t) for f, t in zip(d["frames"], at_10)])
     source = {"kind": "transforms", "data": str(data), "codec": "png"}
     hand, kept = cameras_of(scenario({**source, "fps": fps} if fps else source)).values()

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
-from camera_node.sources.datasets.records import Dataset, DatasetError
+from camera_node.sources.datasets.records import Dataset, DatasetError, find_files
 from camera_node.sources.datasets.rgbd.recorded_messages import (
     COMPRESSED,
     Calibration,
@@ -37,7 +37,11 @@ _ROS = (b"ros2", b"ros1")
 
 def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
     """The images of a file's cameras that have a lens and a pose. Raises DatasetError."""
-    file = next(iter(sorted(path.glob(FILES[0]))), path) if path.is_dir() else path
+    found = find_files(path, FILES) if path.is_dir() else [path]
+    if len(found) != 1:
+        names = ", ".join(each.name for each in found) or "none"
+        raise DatasetError(f"{path}: expected one {FILES[0]}, found {names}; name the file itself")
+    file = found[0]
     if _of_ros(file):
         from camera_node.sources.datasets.rgbd import rosbag
 

@@ -322,8 +322,13 @@ def test_a_trajectory_gives_the_poses(tmp_path):
     (tmp_path / "hand.yaml").write_text(json.dumps(mount))
     held = opened(video_scenario(file, trajectory={**trajectory, "hand_eye": "hand.yaml"}))["cam01"].read(9)
     assert held.pose.translation_m == pytest.approx((5.5, 0, 0)) and held.pose_gap_ns == 0
-    for wrong, key in (({"hand_eye": "none.yaml"}, "hand_eye"), ({"files": {"cam01": "none.txt"}}, "files.cam01")):
-        with pytest.raises(ScenarioError, match=rf"trajectory.{key}.*none"):
+    (tmp_path / "none-carried.yaml").write_text(json.dumps({"setup": "eye-to-hand", **mount}))
+    for wrong, key in (
+        ({"hand_eye": "none.yaml"}, "hand_eye"),
+        ({"hand_eye": "none-carried.yaml"}, "hand_eye: .* its camera stands still,"),
+        ({"files": {"cam01": "none.txt"}}, "files.cam01"),
+    ):
+        with pytest.raises(ScenarioError, match=rf"trajectory.{key}.*no(ne|thing)"):
             opened(video_scenario(file, trajectory={**trajectory, **wrong}))
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from camera_node.cli import _recording, main
 from camera_node.sources.datasets.formats import open_dataset
+from camera_node.sources.datasets.rgbd import foxglove
 from edge_server.experiments.scenes.recorded import load_recorded
 from freshfield.geometry import Pose, look_at
 from tests.camera_node.sources.datasets.photos import fails, opened
@@ -274,6 +275,9 @@ def test_images_depth_and_poses_of_a_recording(tmp_path, encoding):
         measured = record.depth()
         assert np.array_equal(measured.counts, MM) and measured.meters_per_count == 0.001
         assert measured.after_image_ns == 8_000_000 and measured.intrinsics is None
+    (tmp_path / "walk.mcap").touch()  # which of the two?
+    for load in (open_dataset, foxglove.load_dataset):
+        fails(r"run\.mcap, walk\.mcap.* name the file itself", load, tmp_path)
 
 
 @pytest.mark.stability
