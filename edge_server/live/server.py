@@ -194,6 +194,8 @@ class EdgeServer:
             flat_db=lambda: self.scoring.baselines.mean.mean_color_db,
             so_far=lambda: self.scoring.so_far,
         )
+        ended_s = earlier.uptime_s or 0.0
+        self.state.events.extend((round(event.t_s - ended_s, 3), event.what) for event in earlier.events)
         log.info("%s", self.state.chosen)
         write_json(options.out / "frontier.json", msgspec.to_builtins(self.frontier))
         self.journal = Journal(options.out, self.status)

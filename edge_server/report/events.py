@@ -13,7 +13,7 @@ from edge_server.run_records import AgesRow, ChannelChange, Event
 
 def events(files: RunFiles) -> list[dict[str, Any]]:
     """[{t_s: seconds since the edge started, what: in words}], in order; the ``MOST_EVENTS`` first."""
-    restarted_s = files.restarts_s[-1] if files.restarts_s else 0.0  # the edge's events and start are the last one's
+    restarted_s = files.restarts_s[-1] if files.restarts_s else 0.0  # the edge's times and start are the last one's
     found = [Event(event.t_s + restarted_s, event.what) for event in files.edge.events]
     if (began_ns := files.edge.started_ns) is not None:
         changes = files.channel.changes
