@@ -35,6 +35,7 @@ from edge_server.live.output.journal import shown_line
 from edge_server.live.state import Publication
 from edge_server.machine import run_facts, versions
 from edge_server.scheduler import parse_policy, short_name
+from edge_server.scheduler.learned.decision_record import forget_decisions
 from edge_server.settings import (
     ComputeConfig,
     EdgeConfig,
@@ -87,6 +88,7 @@ def _simulate(args: argparse.Namespace) -> None:
     config = read_config(scenario)
     deployment, missing = open_simulation(scenario, folders, lambda new: _settings(new, args), say, published)
     if args.out is not None:
+        forget_decisions(args.out)  # of the simulation that this one replaces
         decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
     watched = None
     if scenario.held_out_every:

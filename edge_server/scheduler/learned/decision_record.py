@@ -124,6 +124,12 @@ def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
     return RecordedDecision(decision, images, about["embedding"])
 
 
+def forget_decisions(out: Path) -> None:
+    """Delete what an earlier run recorded under ``out``. Raises OSError."""
+    for path in _numbered(out / FOLDER):
+        path.unlink()
+
+
 def _as_arrays(
     decision: Decision, policy: str, embedding: dict[str, Any] | None
 ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

@@ -192,6 +192,8 @@ def test_what_a_learned_policy_decided_is_kept_as_of_a_live_run(tmp_path: Path):
         decided = read_decision(out, number).decision
         used = [c for c, chosen in zip(decided.state.cameras, decided.action) if chosen]
         assert lines[number]["selected"] == used
+    assert main([str(file), *words[:4]]) == 0  # another policy takes the folder
+    refused(ValueError, "no decisions are recorded", read_decision, out)
 
 
 def test_costs_are_measured_into_the_file_that_a_scenario_names(tmp_path: Path, capsys):
