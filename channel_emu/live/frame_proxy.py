@@ -29,7 +29,7 @@ from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.model.counter_rng import stream_key
 from channel_emu.model.link import EventKind
 from channel_emu.model.settings import ChannelConfig
-from freshfield.files import write_json
+from freshfield.files import read_status, write_json
 from freshfield.frame import FrameRejected, counted_ids, parse, valid_id
 from freshfield.ledger import Ledger
 from freshfield.limits import MAX_STREAMS_PER_CAMERA
@@ -75,6 +75,10 @@ class FrameProxy(Proxy):
         self._warn_at_ns = self.origin_ns + tuned.WARN_AFTER_NS
         self.flows = {camera: self._flow(camera) for camera in cameras}
         self._control = ChannelService(self)
+        if changes := read_status(out / "channel.json").get("changes"):  # of an earlier process
+            self._control.changes.extend(changes)
+            if changes[-1].get("loss") is not None:  # it ended with that process
+                self._control.changes.append({"at_ns": self.origin_ns, "delay_ms": None, "loss": None})
         self._handlers = {
             PUSH: grpc.stream_stream_rpc_method_handler(self._push),
             _EXCHANGE: grpc.unary_unary_rpc_method_handler(self._pass_exchange),

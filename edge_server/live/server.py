@@ -29,7 +29,7 @@ from edge_server.live import live_constants as tuned
 from edge_server.live.field_updater import open_updater
 from edge_server.live.frontier import open_frontier
 from edge_server.live.grpc_services import GrpcThread
-from edge_server.live.ingest import Ingest, LastFrames, percentile
+from edge_server.live.ingest import Ingest, percentile
 from edge_server.live.loop import UpdateLoop
 from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
@@ -149,6 +149,9 @@ class EdgeServer:
             self.recorder = Recorder(options.record, scenario.name)
             log.info("recording to %s", self.recorder.file)
         self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)  # once nothing above can fail any more
+        earlier = _earlier(options.out / "edge.json")
+        counted = earlier.updates or UpdateCounts()  # of frames, as the ledgers, which go on
+        self._earlier_undecodable, self._earlier_shed = counted.undecodable or 0, counted.shed or 0
         self.ingest = Ingest(
             self.clock,
             self.buffer,
@@ -157,7 +160,7 @@ class EdgeServer:
             self.scoring.held_out_frame,
             None if self.recorder is None else self.recorder.frame,
             scenario.max_side_px,
-            _last_frames(options.out / "edge.json"),
+            earlier.last_frames,
             scenario.codec,
         )
         self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
@@ -191,6 +194,8 @@ class EdgeServer:
             flat_db=lambda: self.scoring.baselines.mean.mean_color_db,
             so_far=lambda: self.scoring.so_far,
         )
+        ended_s = earlier.uptime_s or 0.0
+        self.state.events.extend((round(event.t_s - ended_s, 3), event.what) for event in earlier.events)
         log.info("%s", self.state.chosen)
         write_json(options.out / "frontier.json", msgspec.to_builtins(self.frontier))
         self.journal = Journal(options.out, self.status)
@@ -395,8 +400,8 @@ class EdgeServer:
                     count=self.updater.number,
                     ms_p50=percentile(self._update_ms, 50),
                     ms_p95=percentile(self._update_ms, 95),
-                    undecodable=self.updater.decoder.undecodable + self.scoring.undecodable,
-                    shed=self.buffer.shed,
+                    undecodable=self._earlier_undecodable + self.updater.decoder.undecodable + self.scoring.undecodable,
+                    shed=self._earlier_shed + self.buffer.shed,
                 )
             ),
             "foreground": None if (cut := self.updater.decoder.foreground) is None else cut.status(),
@@ -445,12 +450,12 @@ class EdgeServer:
                 self.recorder.close()
 
 
-def _last_frames(path: Path) -> LastFrames:
-    """Of an earlier process, as its status says."""
+def _earlier(path: Path) -> EdgeStatus:
+    """The status of an earlier process."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=EdgeStatus).last_frames
+        return msgspec.json.decode(path.read_bytes(), type=EdgeStatus)
     except (OSError, ValueError, RecursionError):
-        return {}
+        return EdgeStatus()
 
 
 def _values(of: Any, *names: str) -> dict[str, Any]:

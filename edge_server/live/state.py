@@ -137,7 +137,8 @@ class EdgeState:
     nothing is held out the views learned from; None: not known.
     so_far: scores of held-out cameras that move.
     warnings: what other machines can do here that they should not, in words (--insecure).
-    events: (seconds since the run began, what happened), for the report; ``note`` adds one.
+    events: (seconds since the run began, what happened), for the report; ``note`` adds one. Those of an earlier process
+        have negative seconds: before it ended.
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
     """
 

@@ -16,8 +16,8 @@ copy counts as ``sent``, every other one as ``duplicated``. Ends of copies:
 3. Second-hand statements count only for copies that the above have not ended, because a process further down
    the path held the frame later: an ``answered`` of the node that refuses, then ``broken``.
 4. ``cut_off``: no process wrote the end, and a process that may have held the copy was killed or still runs:
-   its ledger ends without ``closed``, and a line about the frame is within ``CUT_OFF_NS`` of that end. A
-   frame that such a node captured last and did not send counts as ``waiting``.
+   its ledger ends without ``closed``, and a line about the frame is within ``CUT_OFF_NS`` of that end (on the
+   line's own clock). A frame that such a node captured last and did not send counts as ``waiting``.
 
 A copy with no end at all is in no term, so the second sum then fails. ``doubts`` says in words why an account
 does not close: a sum that does not come out, statements that cannot all be true (``contradictions``, such as
@@ -38,10 +38,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from edge_server.report.report_constants import CUT_OFF_NS, MOST_CONTRADICTIONS
-from freshfield.ledger import LedgerReader
+from freshfield.ledger import Event, LedgerReader
 
 # Ends that the emulator's link gives a frame. ``broken`` is not one: a later process may know better.
 LINK_ENDS = ("skipped", "dropped_busy", "superseded", "lost", "in_flight")
@@ -278,24 +279,39 @@ def _without_a_line(path: Path) -> bool:
         return False
 
 
-def _cut_off_ends(ledgers: Sequence[LedgerReader]) -> list[tuple[int, int, int]]:
-    """(number of the role, first and last instant of its last moments) of each ledger without ``closed``."""
+def _cut_off_ends(ledgers: Sequence[LedgerReader]) -> list[tuple[int, list[Event]]]:
+    """(number of the role, last events) of each ledger without ``closed``."""
     ends = []
     for ledger in ledgers:
         try:
-            last = ledger.last()
+            tail = ledger.tail()
         except OSError:
             continue
-        if last is not None and last.event != "closed" and ledger.role in _ROLES:
-            ends.append((_ROLES.index(ledger.role), last.t_ns - CUT_OFF_NS, last.t_ns + CUT_OFF_NS))
+        if tail and tail[-1].event != "closed" and ledger.role in _ROLES:
+            ends.append((_ROLES.index(ledger.role), tail))
     return ends
+
+
+def _last_moments(ledger: LedgerReader, ends: Sequence[tuple[int, list[Event]]]) -> list[tuple[int, int, int]]:
+    """(number of the role, first and last instant) of the last moments of each of ``ends``, on the clock of ``ledger``:
+    the frames about which both wrote tell how far the clocks of two machines are apart."""
+    wrote: dict[tuple[str, str, int], list[tuple[int, int]]] = {}
+    for number, (_, tail) in enumerate(ends):
+        for e in tail:
+            wrote.setdefault((e.camera, e.session, e.sequence), []).append((number, e.t_ns))
+    apart: list[list[int]] = [[] for _ in ends]
+    for e in ledger if ends else ():
+        for number, t_ns in wrote.get((e.camera, e.session, e.sequence), ()):
+            apart[number].append(e.t_ns - t_ns)
+    last_ns = [tail[-1].t_ns + (int(median(found)) if found else 0) for (_, tail), found in zip(ends, apart)]
+    return [(role, at_ns - CUT_OFF_NS, at_ns + CUT_OFF_NS) for (role, _), at_ns in zip(ends, last_ns)]
 
 
 def _read_ledger(
     contents: _LedgerContents,
     number: int,
     ledger: LedgerReader,
-    ends: Sequence[tuple[int, int, int]],
+    ends: Sequence[tuple[int, list[Event]]],
     accounting: FrameAccounting,
 ) -> None:
     """Read ledger ``number`` into ``contents``, and what is missing into ``accounting``. ends: from
@@ -304,7 +320,7 @@ def _read_ledger(
     known = _EVENTS.get(role, set())
     after, lost, lost_at_end = contents.histories.after, 0, 0
     try:
-        complete, closed = ledger.complete, ledger.closed
+        complete, closed, moments = ledger.complete, ledger.closed, _last_moments(ledger, ends)
         for e in ledger:
             event = e.event
             if event in known:
@@ -320,7 +336,7 @@ def _read_ledger(
                     contents.accepted.add(e.camera)
                 frames = contents.frames.setdefault((e.camera, e.session), {})
                 frames[e.sequence] = after(frames.get(e.sequence, 0), role, event, number, complete)
-                for ended, first_ns, last_ns in ends:
+                for ended, first_ns, last_ns in moments:
                     if first_ns <= e.t_ns <= last_ns:
                         frame = (e.camera, e.session, e.sequence)
                         contents.near_end[frame] = contents.near_end.get(frame, 0) | 1 << ended

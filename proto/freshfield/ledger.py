@@ -138,15 +138,19 @@ class LedgerReader:
         """All events, in memory."""
         return tuple(self)
 
-    def last(self) -> Event | None:
-        """The last valid event, found in the file's end; None if there is none."""
+    def tail(self) -> list[Event]:
+        """The last valid events, found in the file's end."""
         with self.path.open("rb") as file:
             end = file.seek(0, 2)
             start = max(self._body, end - _TAIL_BYTES)
             file.seek(start)
             lines = file.read(end - start).split(b"\n")[:-1]
         whole = lines if start == self._body else lines[1:]
-        return next((event for line in reversed(whole) if (event := _parse(line + b"\n")) is not None), None)
+        return [event for line in whole if (event := _parse(line + b"\n")) is not None]
+
+    def last(self) -> Event | None:
+        """The last valid event, found in the file's end; None if there is none."""
+        return next(reversed(self.tail()), None)
 
     @property
     def complete(self) -> bool:

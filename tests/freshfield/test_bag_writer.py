@@ -13,6 +13,7 @@ pytest.importorskip("mcap", reason="needs the extra mcap")
 from rosbags.highlevel import AnyReader
 
 from camera_node.sources.datasets.formats import open_dataset
+from camera_node.sources.datasets.records import DatasetError
 from edge_server.live.output.recorder import Recorder
 from freshfield import frame as wire
 from freshfield import payload
@@ -103,7 +104,7 @@ def test_our_reader_gives_the_same_pixels_and_depth_in_whole_millimeters(tmp_pat
 
 
 @pytest.mark.stability
-def test_what_cannot_be_decoded_costs_itself_and_a_killed_bag_is_read(tmp_path, caplog):
+def test_what_cannot_be_decoded_costs_itself_and_a_killed_bag_says_how_it_is_read(tmp_path, caplog):
     sent = sent_frames("zstd")
     sent[3][0].payload = b"\0" * 50
     recorder = record(tmp_path / "bag", sent)
@@ -115,4 +116,5 @@ def test_what_cannot_be_decoded_costs_itself_and_a_killed_bag_is_read(tmp_path, 
     refused(ValueError, "Out of range", writer.data, "/scores", "freshfield.Decision", {}, {"psnr_db": float("nan")}, 5)
     writer.abandon()
     assert not (tmp_path / "killed/metadata.yaml").exists()
+    refused(DatasetError, "mcap recover", open_dataset, tmp_path / "killed/killed.mcap")
     assert Recorder(tmp_path / "bag", "test").file.name == "bag-2", "a server that starts again keeps the first"

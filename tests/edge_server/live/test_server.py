@@ -126,6 +126,8 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert 'freshfield_camera_age_seconds{camera="cam01"}' in text
     assert "freshfield_psnr_db" in text and "freshfield_updates_total" in text
     server.loop.without_step += 1000  # on a machine that is too slow
+    server.buffer.shed += 7
+    server.state.note("an operator reset the field")
     run.end()
     out = tmp_path / "out"
     series = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
@@ -149,6 +151,10 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert {camera: known[camera]["s1"][0] for camera in known} == last
     fresh = serve().server
     assert fresh.updater.number == 0 and not fresh.state.started
+    (event,) = fresh.status()["events"]  # of the first process, before this one
+    assert event["what"] == "an operator reset the field" and -60 < event["t_s"] <= 0
+    counted = fresh.status()["updates"]  # of frames: as in the ledgers, those of the first process count
+    assert counted["shed"] >= 7
     kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
     assert kept[: len(series)] == series  # what the first process wrote is still there
 

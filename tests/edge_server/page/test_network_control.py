@@ -35,6 +35,9 @@ async def test_a_visitor_changes_the_network_and_gives_it_back(tmp_path):
 
         await asyncio.to_thread(visit)
         assert changes() == [(0.0, 1.0), (1000.0, 1.0), (None, None)]
+    (tmp_path / "channel.json").write_text('{"changes": [{"at_ns": 5, "delay_ms": 0.0, "loss": 1.0}]}')  # it is killed
+    async with emulate(tmp_path, {}, cameras=("cam00",)) as emulation:
+        assert changes() == [(0.0, 1.0), (None, None)]
 
 
 def control_of(network: EmulatorControl) -> NetworkControl:

@@ -158,6 +158,14 @@ def test_an_old_frame_without_an_end_is_no_excuse_of_a_kill(tmp_path):
     assert found.contradictions == ["a s 0: the end of 1 sent copies is in no ledger"]
 
 
+def test_clocks_of_two_machines_far_apart_leave_cut_off_what_a_kill_cut_off(tmp_path):
+    write(tmp_path, "node", sent(0, 1))
+    write(tmp_path, "emulator", told("0:received 0:forwarded 1:received 1:forwarded"))
+    with write(tmp_path, "edge", [], closed=False).open("a") as file:
+        file.write(f"{3600 * 10**9}\ta\ts\t0\tdelivered\t\n")
+    counts(tmp_path, captured=2, sent=2, delivered=1, cut_off=1)
+
+
 def test_frames_of_unknown_origin_are_counted_apart(tmp_path):
     write(tmp_path, "node", HELD["node"])
     write(tmp_path, "emulator", [("intruder", "x", 0, "rejected", "unknown_camera")])

@@ -13,12 +13,12 @@ from edge_server.live.output.journal import Journal
 from edge_server.report import figures
 from edge_server.report.build_report import assemble, build_report
 from edge_server.report.conclusion import conclusion
-from edge_server.report.events import silences
+from edge_server.report.events import events, silences
 from edge_server.report.figures import draw_ages, draw_fidelity, draw_frontier
 from edge_server.report.report_constants import MOST_EVENTS
 from edge_server.report.run_files import continuous, read_run_files
 from edge_server.report.run_statistics import SERIES, fidelity, updates
-from edge_server.run_records import AgesRow, EdgeStatus, UpdateCounts, UpdateRow
+from edge_server.run_records import AgesRow, ChannelChange, EdgeStatus, UpdateCounts, UpdateRow
 from freshfield.scenario import NOTHING_HELD_OUT
 from freshfield.untrusted import read_json
 from freshfield_up.status import summarize
@@ -200,6 +200,10 @@ def test_rows_are_in_order_of_time_also_across_a_restart(tmp_path):
         journal.close()
     files = read_run_files(tmp_path / "again")
     assert files.restarts_s == [10.0] and [row.t_s for row in files.series] == pytest.approx([10.0 + published[0].t_s])
+    (tmp_path / f"again/ledger-edge-edge-{50 * 10**9}.tsv").touch()
+    files.edge.started_ns = 100 * 10**9  # after 40 s in which no edge ran
+    files.channel.changes = [ChannelChange(second * 10**9) for second in (54, 80, 103)]
+    assert [event["t_s"] for event in events(files) if "network" in event["what"]] == [4.0, 10.0, 13.0]
     assert files.shown == [] and assemble(files)["fidelity"]["late_s"] == pytest.approx(20.0 - 0.2 * (20.0 - 13.1))
 
 
@@ -245,8 +249,8 @@ def test_what_should_be_something_else_adds_a_note(tmp_path, file, text, note):
 def test_hostile_names_do_not_reach_the_page_as_markup_nor_many_events(tmp_path):
     write_run(tmp_path, publications=2, ages=2)
     evil = "<script>alert(1)</script>"
-    events = [{"t_s": t_s, "what": evil} for t_s in (-1.0, *range(3 * MOST_EVENTS))]
-    edit_edge(tmp_path, scenario=evil, field=evil, lpips_missing=evil, chosen=evil, events=events)
+    many = [{"t_s": t_s, "what": evil} for t_s in (-1.0, *range(3 * MOST_EVENTS))]
+    edit_edge(tmp_path, scenario=evil, field=evil, lpips_missing=evil, chosen=evil, events=many)
     (tmp_path / "ages.jsonl").write_text(json.dumps({"t_s": 1, "age_ms": {evil: 3}}) + "\n")
     report, page = page_of(tmp_path)
     assert "<script" not in page and page.count("&lt;script&gt;alert(1)") == 6 + MOST_EVENTS - 2  # two of the channel

@@ -74,7 +74,7 @@ class FoxgloveMessages(Messages):
                         yield channel.topic, t_ns, _record(kind, classes[kind].FromString(message.data), t_ns)
         except (OSError, McapError, DecodeError, ValueError, EOFError) as error:
             why = error or type(error).__name__
-            raise DatasetError(f"{self.where}: cannot be read as MCAP: {why}; cut short?") from None
+            raise DatasetError(f"{self.where}: cannot be read as MCAP: {why}; cut short? (`mcap recover`)") from None
 
 
 def _of_ros(file: Path) -> bool:

@@ -78,7 +78,7 @@ class BagMessages(Messages):
 
     def _unreadable(self, error: Exception) -> DatasetError:
         text = str(error) or type(error).__name__
-        return DatasetError(f"{self.where}: cannot be read as a ROS bag: {text}; cut short?")
+        return DatasetError(f"{self.where}: cannot be read as a ROS bag: {text}; cut short? (MCAP: `mcap recover`)")
 
 
 def _kind(name: str) -> str:
