@@ -76,6 +76,8 @@ class Pipe(CallFlow):
             writer.write(piece)
             await writer.drain()
 
+        # ``drain`` waits for every byte, so that none is left here when the connection is closed.
+        writer.transport.set_write_buffer_limits(0)
         await self.carry(read, write)
         with contextlib.suppress(OSError):
             writer.write_eof()

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import socket
 import time
 from collections.abc import AsyncIterator
 
@@ -89,6 +90,21 @@ async def test_a_sender_waits_for_a_slow_link():
         await until(lambda: "up bytes" in proxy.links and proxy.links["up bytes"].model.offered >= PIECES_BEHIND)
         await asyncio.sleep(0.2)
         assert proxy.links["up bytes"].model.offered == PIECES_BEHIND
+        writer.close()
+
+
+@pytest.mark.stability
+async def test_a_reader_slower_than_all_others_gets_the_end_too():
+    async with echo({}) as proxy:
+        proxy._listening.sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        client = socket.socket()
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.connect(("127.0.0.1", proxy.port))
+        reader, writer = await asyncio.open_connection(sock=client, limit=1)
+        writer.write(DATA[: 4 * PIECE_BYTES])
+        writer.write_eof()
+        await asyncio.sleep(0.3)
+        assert await reader.read(-1) == DATA[: 4 * PIECE_BYTES]
         writer.close()
 
 
