@@ -11,6 +11,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import socket
+import struct
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +29,8 @@ from freshfield.transport import TransportError, host_port
 
 log = logging.getLogger("channel-emu")
 
+_RESET_AT_CLOSE = struct.pack("ii", 1, 0)
+
 
 class Connection:
     """Two sockets that a reset of the link closes. writers: to the service and to its client."""
@@ -38,8 +42,10 @@ class Connection:
         """Connections are not ended for lack of use."""
 
     def end(self, *_: Any) -> None:
-        """Break the connection."""
+        """Break the connection: both sides see a reset, because an end would look as if nothing were missing."""
         for writer in self._writers:
+            with contextlib.suppress(OSError):  # closed already
+                writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_AT_CLOSE)
             writer.transport.abort()
 
 
@@ -157,5 +163,6 @@ class TcpProxy(Proxy):
         finally:
             for part in parts:
                 part.cancel()
-            await asyncio.gather(*parts, return_exceptions=True)
+            if any(await asyncio.gather(*parts, return_exceptions=True)):  # not both came to their end
+                both.end()
             back.transport.abort()
