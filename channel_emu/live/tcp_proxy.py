@@ -13,7 +13,7 @@ import contextlib
 import logging
 import socket
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import grpc.aio
@@ -76,11 +76,13 @@ class Pipe(CallFlow):
         """Pass on what ``reader`` brings, until its end has been passed on too."""
 
         async def read() -> Any:
-            return await reader.read(tuned.PIECE_BYTES) or grpc.aio.EOF
+            with _as_reset():
+                return await reader.read(tuned.PIECE_BYTES) or grpc.aio.EOF
 
         async def write(piece: bytes) -> None:
-            writer.write(piece)
-            await writer.drain()
+            with _as_reset():
+                writer.write(piece)
+                await writer.drain()
 
         # ``drain`` waits for every byte, so that none is left here when the connection is closed.
         writer.transport.set_write_buffer_limits(0)
@@ -166,3 +168,12 @@ class TcpProxy(Proxy):
             if any(await asyncio.gather(*parts, return_exceptions=True)):  # not both came to their end
                 both.end()
             back.transport.abort()
+
+
+@contextlib.contextmanager
+def _as_reset() -> Iterator[None]:
+    """A peer that no longer answers, or to which no way leads, has broken its connection alone."""
+    try:
+        yield
+    except OSError as error:
+        raise ConnectionResetError(str(error)) from error

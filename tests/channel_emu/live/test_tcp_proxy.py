@@ -118,6 +118,9 @@ async def test_a_reset_breaks_connections_and_the_next_one_works():
                 await writer.drain()
                 assert await reader.read(4)  # a reset, not an end
         assert await through(proxy, b"again") == b"again"
+        silent = asyncio.StreamReader()
+        silent.set_exception(TimeoutError(110, "Connection timed out"))
+        await asyncio.create_task(proxy._accept(silent, writer))  # ends its connection, not the proxy: ``echo`` checks
 
 
 @pytest.mark.stability
