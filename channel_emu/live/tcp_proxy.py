@@ -163,6 +163,8 @@ class TcpProxy(Proxy):
             with contextlib.suppress(ConnectionError):
                 await asyncio.gather(*parts)
         finally:
+            up.close()
+            down.close()
             for part in parts:
                 part.cancel()
             if any(await asyncio.gather(*parts, return_exceptions=True)):  # not both came to their end
