@@ -63,7 +63,7 @@ class CallFlow:
                 self._wake.clear()
                 await self._wake.wait()
         finally:
-            self.close()
+            self._stop()
             reader.cancel()
 
     def settle(self, message: Message, kind: EventKind) -> None:
@@ -78,10 +78,15 @@ class CallFlow:
         self._wake.set()
 
     def close(self) -> None:
-        """End the flow: messages that the link still delivers are counted as cancelled."""
-        self._closed = True
+        """End the flow, as the call is over: until then, a reset of the link ends it, whichever way still carries."""
+        self._stop()
         if self._link is not None:
             self._link.calls.discard(self._call)
+
+    def _stop(self) -> None:
+        """Messages that the link still delivers are counted as cancelled."""
+        self._closed = True
+        if self._link is not None:
             for message in self._messages:
                 if message.delivered:
                     self._cancel(message)

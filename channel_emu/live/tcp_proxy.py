@@ -11,7 +11,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable
+import socket
+import struct
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import grpc.aio
@@ -27,6 +29,8 @@ from freshfield.transport import TransportError, host_port
 
 log = logging.getLogger("channel-emu")
 
+_RESET_AT_CLOSE = struct.pack("ii", 1, 0)
+
 
 class Connection:
     """Two sockets that a reset of the link closes. writers: to the service and to its client."""
@@ -38,8 +42,10 @@ class Connection:
         """Connections are not ended for lack of use."""
 
     def end(self, *_: Any) -> None:
-        """Break the connection."""
+        """Break the connection: both sides see a reset, because an end would look as if nothing were missing."""
         for writer in self._writers:
+            with contextlib.suppress(OSError):  # closed already
+                writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_AT_CLOSE)
             writer.transport.abort()
 
 
@@ -70,12 +76,16 @@ class Pipe(CallFlow):
         """Pass on what ``reader`` brings, until its end has been passed on too."""
 
         async def read() -> Any:
-            return await reader.read(tuned.PIECE_BYTES) or grpc.aio.EOF
+            with _as_reset():
+                return await reader.read(tuned.PIECE_BYTES) or grpc.aio.EOF
 
         async def write(piece: bytes) -> None:
-            writer.write(piece)
-            await writer.drain()
+            with _as_reset():
+                writer.write(piece)
+                await writer.drain()
 
+        # ``drain`` waits for every byte, so that none is left here when the connection is closed.
+        writer.transport.set_write_buffer_limits(0)
         await self.carry(read, write)
         with contextlib.suppress(OSError):
             writer.write_eof()
@@ -153,7 +163,19 @@ class TcpProxy(Proxy):
             with contextlib.suppress(ConnectionError):
                 await asyncio.gather(*parts)
         finally:
+            up.close()
+            down.close()
             for part in parts:
                 part.cancel()
-            await asyncio.gather(*parts, return_exceptions=True)
+            if any(await asyncio.gather(*parts, return_exceptions=True)):  # not both came to their end
+                both.end()
             back.transport.abort()
+
+
+@contextlib.contextmanager
+def _as_reset() -> Iterator[None]:
+    """A peer that no longer answers, or to which no way leads, has broken its connection alone."""
+    try:
+        yield
+    except OSError as error:
+        raise ConnectionResetError(str(error)) from error

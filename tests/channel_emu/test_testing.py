@@ -151,6 +151,11 @@ def test_metadata_status_trailers_and_deadline_pass(channel, greeter):
     assert code_of(stub.unary_unary(HELLO), b"you", timeout=0.02) == "DEADLINE_EXCEEDED"
 
 
+def test_a_reset_ends_a_call_whose_request_has_passed(greeter, channel):
+    link = channel({"faults": {"reset": {"at_ms": [500.0]}}}, to=greeter.address)
+    assert code_of(lambda **o: list(client(link).unary_stream(COUNT)(b"300", **o))) == "UNAVAILABLE"
+
+
 def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter):
     link = channel({"service": "det:5ms", "discipline": "fcfs"}, to=greeter.address, direction="down")
     call = client(link).unary_stream(COUNT)(b"1000", timeout=30)

@@ -25,10 +25,12 @@ class Folders:
     lpips: Path | None = None
 
     def files_of(self, scenario: Scenario) -> list[Path]:
-        """Existing files and folders that a scenario's results depend on: its data set, the files that its channel
-        names, and the weights of LPIPS."""
-        named = [scenario.path.parent / text for text in _texts(scenario.channel)]
-        return [path for path in (self.data_of(scenario), *named, self.lpips) if path is not None and path.exists()]
+        """Existing files and folders that a scenario's results depend on: its data set, the files that its channel,
+        its source (poses) and its edge (models) name, and the weights of LPIPS."""
+        texts = _texts([scenario.channel, scenario.source, scenario.edge])
+        named = [file for text in texts if (file := scenario.path.parent / Path(text).expanduser()).is_file()]
+        paths = dict.fromkeys((self.data_of(scenario), *named, self.lpips))
+        return [path for path in paths if path is not None and path.exists()]
 
     def data_of(self, scenario: Scenario) -> Path | None:
         """A scenario's data set, beside it or in the data folder; None if it names none, or that is not there."""

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import socket
 import time
 from collections.abc import AsyncIterator
 
@@ -93,6 +94,21 @@ async def test_a_sender_waits_for_a_slow_link():
 
 
 @pytest.mark.stability
+async def test_a_reader_slower_than_all_others_gets_the_end_too():
+    async with echo({}) as proxy:
+        proxy._listening.sockets[0].setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
+        client = socket.socket()
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.connect(("127.0.0.1", proxy.port))
+        reader, writer = await asyncio.open_connection(sock=client, limit=1)
+        writer.write(DATA[: 4 * PIECE_BYTES])
+        writer.write_eof()
+        await asyncio.sleep(0.3)
+        assert await reader.read(-1) == DATA[: 4 * PIECE_BYTES]
+        writer.close()
+
+
+@pytest.mark.stability
 async def test_a_reset_breaks_connections_and_the_next_one_works():
     async with echo({"service": "det:5ms", "faults": {"reset": {"at_ms": [400.0]}}}) as proxy:
         reader, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
@@ -100,9 +116,11 @@ async def test_a_reset_breaks_connections_and_the_next_one_works():
             while True:
                 writer.write(b"more")
                 await writer.drain()
-                if not await reader.read(4):
-                    raise ConnectionError
+                assert await reader.read(4)  # a reset, not an end
         assert await through(proxy, b"again") == b"again"
+        silent = asyncio.StreamReader()
+        silent.set_exception(TimeoutError(110, "Connection timed out"))
+        await asyncio.create_task(proxy._accept(silent, writer))  # ends its connection, not the proxy: ``echo`` checks
 
 
 @pytest.mark.stability

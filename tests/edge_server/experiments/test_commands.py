@@ -70,9 +70,13 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
     found, name = read_channel(str(tmp_path / "mine.yaml"))
     assert name == "mine" and found["service"] == f"trace:{tmp_path / 'delays.txt'}"
     (tmp_path / "whole.yaml").write_text(yaml.safe_dump({**RAW, "channel": section}))
-    recorded = replace(load(str(tmp_path / "whole.yaml")), source={"data": "mine.yaml"})
+    source = {"data": "mine.yaml", "trajectory": {"files": {"cam00": "poses.tum"}, "hand_eye": ""}}
+    recorded = replace(load(str(tmp_path / "whole.yaml")), source=source, edge={"embedding": {"model": "yolo.onnx"}})
+    named = [tmp_path / name for name in ("mine.yaml", "delays.txt", "poses.tum", "yolo.onnx")]
+    for file in named[2:]:
+        file.write_bytes(b"")
     for data in (tmp_path, None):  # data beside the scenario need no folder
-        assert Folders(data).files_of(recorded) == [tmp_path / "mine.yaml", tmp_path / "delays.txt"]
+        assert Folders(data).files_of(recorded) == named
     assert read_channel(str(tmp_path / "whole.yaml"))[0] == found
     (tmp_path / "wrong.yaml").write_text("{discipline: sometimes}")
     for text in (str(tmp_path / "wrong.yaml"), str(tmp_path / "none.yaml"), "sms"):
