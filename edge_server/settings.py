@@ -9,6 +9,7 @@ has the figures. Whatever a scenario says itself is left as it is.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -102,6 +103,13 @@ class EdgeConfig(Settings, frozen=True):
     depth_network: Annotated[
         str | None, about("ONNX of relative inverse depth for few fixed cameras, relative to the scenario")
     ] = None
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The color in [0, 1] that the field shows where images are transparent: white, unless its options say so."""
+        named = str(self.field_options.get("background")).replace("black", "#000000")
+        red, green, blue = bytes.fromhex(named[1:] if re.fullmatch("#[0-9a-fA-F]{6}", named) else "ffffff")
+        return red / 255, green / 255, blue / 255
 
 
 def cameras_move(scenario: Scenario) -> bool:

@@ -57,6 +57,11 @@ def same_size(rendering: Image, truth: Image) -> None:
         )
 
 
+def opaque(image: NDArray[np.uint8], background: Color) -> NDArray[np.uint8]:
+    """Bytes (H, W, 3) of an image (H, W, 3 or 4), over ``background`` where it is transparent."""
+    return image if image.shape[2] == 3 else to_bytes(to_unit(image, background=background).astype(np.float32))
+
+
 def to_bytes(image: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.uint8]:
     """Colors (H, W, 3) in [0, 1] as bytes, rounded; bytes as they are."""
     if image.dtype == np.uint8:
