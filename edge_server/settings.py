@@ -9,7 +9,6 @@ has the figures. Whatever a scenario says itself is left as it is.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -18,6 +17,7 @@ from msgspec.structs import replace
 
 from edge_server import edge_constants as tuned
 from edge_server.edge_constants import LONGEST_MS
+from edge_server.fidelity.images import color_behind
 from edge_server.fields.registry import FIELD
 from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.scheduler import Policy, resolve_checkpoint
@@ -106,10 +106,8 @@ class EdgeConfig(Settings, frozen=True):
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """The color in [0, 1] that the field shows where images are transparent: white, unless its options say so."""
-        named = str(self.field_options.get("background")).replace("black", "#000000")
-        red, green, blue = bytes.fromhex(named[1:] if re.fullmatch("#[0-9a-fA-F]{6}", named) else "ffffff")
-        return red / 255, green / 255, blue / 255
+        """The color in [0, 1] that the field shows where images are transparent."""
+        return color_behind(self.field_options)
 
 
 def cameras_move(scenario: Scenario) -> bool:

@@ -20,11 +20,11 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.fitting.misfits import misfits
-from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still, score_views
+from edge_server.experiments.scenes.multiview_still import mean_baselines, open_still, score_views
 from edge_server.experiments.scenes.recorded import MultiviewStill
 from edge_server.export.run_source import Source, holds_checkpoint, open_source
 from edge_server.export.viewed_field import ViewedField
-from edge_server.fidelity.images import to_bytes, to_unit
+from edge_server.fidelity.images import color_behind, to_bytes, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Scorer
 from edge_server.fields import Budget, FitReport, RefinesCameras, checkpoint
@@ -56,7 +56,7 @@ class Fit(ViewedField):
         lpips: Path | None = None,
     ) -> None:
         """data: from ``load``. field: name of the representation. options: of the field, e.g. ``{"gaussians": 4096}``.
-        lpips: folder of LPIPS weights. Transparent images lie over white.
+        lpips: folder of LPIPS weights. Transparent images lie over white, or the option ``background``.
 
         Raises OptionError for a field or option that there is not, DatasetError for a camera that no field can use.
         """
@@ -82,7 +82,7 @@ class Fit(ViewedField):
         self.rows: list[UpdateRow] = []
         self.outside: float | None = None
         self.spent_s, self.spent_steps = 0.0, 0
-        self._scorer = Scorer(metric, background=WHITE)
+        self._scorer = Scorer(metric, background=color_behind(self.options))
         self._scored_views = data.held_out or data.training[: tuned.SCORED_OF_TRAINING]
         self._shown: NDArray[np.float32] | None = None
         self._processes: list[dict[str, Any]] = []
@@ -184,7 +184,7 @@ class Fit(ViewedField):
                 [v.camera_to_world for v, _ in refined], [c.camera_to_world for _, c in refined]
             )
             found += [] if common is None else [common.words]
-        found += misfits(self.field, self.data.training, Scorer(None, background=WHITE))
+        found += misfits(self.field, self.data.training, Scorer(None, background=self._scorer.background))
         self.notes += found
         return found
 
@@ -200,7 +200,7 @@ class Fit(ViewedField):
         _write_lines(folder / "processes.jsonl", self._processes)
         write_json(folder / "edge.json", self._status())
         if self._shown is not None:
-            truth = to_unit(self._scored_views[0].image, "held-out view", WHITE)
+            truth = to_unit(self._scored_views[0].image, "held-out view", self._scorer.background)
             _write_png(folder / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
             _write_png(folder / "rendered.png", to_bytes(self._shown))
         return build_report(folder)
@@ -228,7 +228,7 @@ class Fit(ViewedField):
                 "held_out": [v.camera for v in d.held_out],
                 "missing": d.missing,
             },
-            "baseline": mean_baselines(d.training, d.held_out, WHITE),
+            "baseline": mean_baselines(d.training, d.held_out, self._scorer.background),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else "alex",
         }
