@@ -155,8 +155,8 @@ class Fit(ViewedField):
         return report is not None
 
     def resume(self, folder: Path, until_s: float) -> None:
-        """Go on from what ``save`` wrote. Raises OptionError if there is nothing, or it has been fitted for
-        ``until_s`` seconds already."""
+        """Go on from what ``save`` wrote. Raises OptionError if there is nothing, if it has been fitted for ``until_s``
+        seconds already, or if it has learned from what is held out now."""
         try:
             state, about = checkpoint.load(folder / "field")
             self.field.load_state(state)
@@ -165,6 +165,12 @@ class Fit(ViewedField):
             self._processes = _read_lines(folder / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
             raise OptionError(f"--resume: {folder} holds no fit to go on from: {error}") from None
+        learned = {view.camera for view in self.field.views}
+        if known := [view.camera for view in self.data.held_out if view.camera in learned]:
+            raise OptionError(
+                f"--resume: {folder} has learned {known[0]} already, which is to be held out now: give the --holdout "
+                "that it began with"
+            )
         if self.spent_s > until_s - tuned.SHORTEST_SLICE_S:
             raise OptionError(
                 f"--resume: {folder} has been fitted for {self.spent_s:.1f} s already: give more --seconds"

@@ -48,6 +48,8 @@ def test_it_learns_goes_on_and_leaves_report_pictures_and_checkpoint(tmp_path, c
     assert state and about["seconds"] == series[-1]["t_s"]
     assert fit(tmp_path / "set", out, "--seconds", "2.5", "--resume") == 2
     assert "give more --seconds" in capsys.readouterr().err
+    assert fit(tmp_path / "set", out, "--seconds", "5", "--resume", "--holdout", "3") == 2
+    assert "has learned" in (said := capsys.readouterr().err) and "give the --holdout that it began with" in said
 
 
 def test_a_scene_of_ours_is_fitted_by_its_name(tmp_path, capsys, monkeypatch):
