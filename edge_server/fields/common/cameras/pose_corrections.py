@@ -148,6 +148,7 @@ class PoseCorrections:
     def forget(self, camera: str) -> None:
         """Forget a view's correction."""
         del self.known[camera]
+        self._ranks.pop(camera, None)
         self._sorted = {}
 
     def newest(self, track: str, count: int) -> list[PoseCorrection]:

@@ -128,6 +128,8 @@ def test_a_step_moves_the_views_taken_around_it_but_not_those_without_times() ->
         for one in (poses, again):
             one.descend(views[1], np.full(6, -3.0), normal, WALL_M / LENS.fx)
         assert again.meta() == poses.meta()
+        again.forget("v07")
+        assert "v07" not in again._ranks, "a carried camera forgets views for as long as it runs"
 
 
 @pytest.mark.stability
