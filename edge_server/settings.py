@@ -17,6 +17,7 @@ from msgspec.structs import replace
 
 from edge_server import edge_constants as tuned
 from edge_server.edge_constants import LONGEST_MS
+from edge_server.fidelity.images import color_behind
 from edge_server.fields.registry import FIELD
 from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.scheduler import Policy, resolve_checkpoint
@@ -102,6 +103,11 @@ class EdgeConfig(Settings, frozen=True):
     depth_network: Annotated[
         str | None, about("ONNX of relative inverse depth for few fixed cameras, relative to the scenario")
     ] = None
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """The color in [0, 1] that the field shows where images are transparent."""
+        return color_behind(self.field_options)
 
 
 def cameras_move(scenario: Scenario) -> bool:

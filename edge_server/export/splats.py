@@ -21,7 +21,7 @@ from edge_server.fields.splat.planar import unit_quaternions
 from edge_server.fields.splat.splat_constants import LOG_SCALE_HIGH, LOG_SCALE_LOW
 from freshfield.files import write_bytes
 
-SPZ_BITS = 12  # of a position behind the binary point, as others write it
+SPZ_BITS = 12  # of a position behind the binary point, as others write it; of scenes under a meter: of their size
 SPZ_WHOLE_BITS = 23  # of a position in all, without its sign
 Y0 = 0.28209479177387814
 # Signs of the harmonics of degree 1: Kerbl et al. negate those of odd order.
@@ -41,8 +41,8 @@ def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
 
 
 def spz_bytes(table: NDArray[np.void]) -> bytes:
-    """The rows of ``splat_table`` as SPZ, version 3: positions as multiples of 2^-12 m (coarser beyond 2 km), the rest
-    in a byte a number. Raises ExportError without gsply."""
+    """The rows of ``splat_table`` as SPZ, version 3: positions as multiples of 2^-12 m (coarser beyond 2 km, finer
+    where most lie within a meter), the rest in a byte a number. Raises ExportError without gsply."""
     gsply = import_gsply()
 
     def columns(*names: str) -> NDArray[np.float32]:
@@ -59,7 +59,9 @@ def spz_bytes(table: NDArray[np.void]) -> bytes:
         sh0=columns("f_dc_0", "f_dc_1", "f_dc_2"),
         shN=rest.reshape(len(table), 3, -1).transpose(0, 2, 1),
     )
-    bits = min(SPZ_BITS, SPZ_WHOLE_BITS - int(np.frexp(np.abs(means).max())[1]))
+    usual_m = np.median(np.abs(means - np.median(means, axis=0)).max(axis=1))
+    finest = SPZ_WHOLE_BITS - int(np.frexp(np.abs(means).max())[1])
+    bits = min(SPZ_BITS - min(int(np.frexp(usual_m)[1]), 0), finest, SPZ_WHOLE_BITS)
     with tempfile.TemporaryDirectory() as folder:
         gsply.write_spz(file := Path(folder) / "splats.spz", gaussians, fractional_bits=max(bits, 1))
         return file.read_bytes()

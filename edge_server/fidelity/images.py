@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +13,13 @@ Image = NDArray[np.float64]
 Color = tuple[float, float, float]
 
 BLACK: Color = (0.0, 0.0, 0.0)
+
+
+def color_behind(options: Mapping[str, Any]) -> Color:
+    """The color in [0, 1] that a field of these options shows where images are transparent: white, or as they say."""
+    named = str(options.get("background")).replace("black", "#000000")
+    red, green, blue = bytes.fromhex(named[1:] if re.fullmatch("#[0-9a-fA-F]{6}", named) else "ffffff")
+    return red / 255, green / 255, blue / 255
 
 
 class ImageError(ValueError):
@@ -55,6 +66,11 @@ def same_size(rendering: Image, truth: Image) -> None:
             f"rendering is {rendering.shape[1]} x {rendering.shape[0]} but the truth is "
             f"{truth.shape[1]} x {truth.shape[0]}: render with the held-out camera's own intrinsics"
         )
+
+
+def opaque(image: NDArray[np.uint8], background: Color) -> NDArray[np.uint8]:
+    """Bytes (H, W, 3) of an image (H, W, 3 or 4), over ``background`` where it is transparent."""
+    return image if image.shape[2] == 3 else to_bytes(to_unit(image, background=background).astype(np.float32))
 
 
 def to_bytes(image: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.uint8]:

@@ -116,7 +116,7 @@ class Scorer:
         """
         a = to_unit(rendering, "rendering")
         b = to_unit(truth, "held-out frame", self.background)
-        moving = moving_mask(b, earlier, bound)
+        moving = moving_mask(b, [to_unit(e, "earlier truth", self.background) for e in earlier], bound)
         total = psnr(a, b, mask)
         if total is None:
             raise ImageError("held-out frame: every pixel is masked")

@@ -127,8 +127,9 @@ class EdgeServer:
             if config.lpips == "none"
             else open_lpips(options.lpips_folder)
         )
+        scorer = Scorer(lpips, config.background)
         self.scoring = ScoringThread(
-            scenario.held_out, Scorer(lpips), self._scored, self._shown, scenario.seed, config.noisy_truth
+            scenario.held_out, scorer, self._scored, self._shown, scenario.seed, config.noisy_truth
         )
         try:
             self.policies = LivePolicies(config.policy.name, config.policy.value, partial(scenario.rng, "policy"))

@@ -92,6 +92,11 @@ def test_files_that_a_section_names_lie_beside_the_scenario():
     assert named(**own) == (EmbeddingConfig("/there/m/yolo.onnx", 16), "/there/cat-seg.onnx")
 
 
+@pytest.mark.parametrize(("named", "level"), [("auto", 1.0), ("black", 0.0), ("#333333", 0.2), ("#3", 1.0)])
+def test_transparent_images_are_scored_over_the_color_that_the_field_shows_there(named, level):
+    assert read_config(scenario({"field_options": {"background": named}})).background == (level,) * 3
+
+
 def test_a_section_of_another_kind_is_refused_by_name():
     uncertain = {"foreground": {"detector": "tile", "confidence": 1.5}}
     wrong = (({"field_options": 3}, "field_options"), ([], "edge"), ({"field": 3}, "field"), (uncertain, "confidence"))

@@ -20,11 +20,11 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.fitting.misfits import misfits
-from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines, open_still, score_views
+from edge_server.experiments.scenes.multiview_still import mean_baselines, open_still, score_views
 from edge_server.experiments.scenes.recorded import MultiviewStill
 from edge_server.export.run_source import Source, holds_checkpoint, open_source
 from edge_server.export.viewed_field import ViewedField
-from edge_server.fidelity.images import to_bytes, to_unit
+from edge_server.fidelity.images import color_behind, to_bytes, to_unit
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Scorer
 from edge_server.fields import Budget, FitReport, RefinesCameras, checkpoint
@@ -56,7 +56,7 @@ class Fit(ViewedField):
         lpips: Path | None = None,
     ) -> None:
         """data: from ``load``. field: name of the representation. options: of the field, e.g. ``{"gaussians": 4096}``.
-        lpips: folder of LPIPS weights. Transparent images lie over white.
+        lpips: folder of LPIPS weights. Transparent images lie over white, or the option ``background``.
 
         Raises OptionError for a field or option that there is not, DatasetError for a camera that no field can use.
         """
@@ -82,7 +82,7 @@ class Fit(ViewedField):
         self.rows: list[UpdateRow] = []
         self.outside: float | None = None
         self.spent_s, self.spent_steps = 0.0, 0
-        self._scorer = Scorer(metric, background=WHITE)
+        self._scorer = Scorer(metric, background=color_behind(self.options))
         self._scored_views = data.held_out or data.training[: tuned.SCORED_OF_TRAINING]
         self._shown: NDArray[np.float32] | None = None
         self._processes: list[dict[str, Any]] = []
@@ -155,8 +155,8 @@ class Fit(ViewedField):
         return report is not None
 
     def resume(self, folder: Path, until_s: float) -> None:
-        """Go on from what ``save`` wrote. Raises OptionError if there is nothing, it has been fitted for ``until_s``
-        seconds already, or other views were held out: it may have learned those that would be scored."""
+        """Go on from what ``save`` wrote. Raises OptionError if there is nothing, if it has been fitted for ``until_s``
+        seconds already, or if it has learned from what is held out now."""
         try:
             state, about = checkpoint.load(folder / "field")
             self.field.load_state(state)
@@ -165,8 +165,12 @@ class Fit(ViewedField):
             self._processes = _read_lines(folder / "processes.jsonl")
         except (OSError, ValueError, KeyError) as error:
             raise OptionError(f"--resume: {folder} holds no fit to go on from: {error}") from None
-        if about.get("held_out", held_out := self._held_out()) != held_out:  # not said by earlier versions
-            raise OptionError(f"--resume: {folder} was fitted with other views held out: give the same --holdout")
+        learned = {view.camera for view in self.field.views}
+        if known := [view.camera for view in self.data.held_out if view.camera in learned]:
+            raise OptionError(
+                f"--resume: {folder} has learned {known[0]} already, which is to be held out now: give the --holdout "
+                "that it began with"
+            )
         if self.spent_s > until_s - tuned.SHORTEST_SLICE_S:
             raise OptionError(
                 f"--resume: {folder} has been fitted for {self.spent_s:.1f} s already: give more --seconds"
@@ -186,7 +190,7 @@ class Fit(ViewedField):
                 [v.camera_to_world for v, _ in refined], [c.camera_to_world for _, c in refined]
             )
             found += [] if common is None else [common.words]
-        found += misfits(self.field, self.data.training, Scorer(None, background=WHITE))
+        found += misfits(self.field, self.data.training, Scorer(None, background=self._scorer.background))
         self.notes += found
         return found
 
@@ -197,19 +201,15 @@ class Fit(ViewedField):
 
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        about = {**self._about(), "steps": self.spent_steps, "held_out": self._held_out()}
-        checkpoint.save(folder / "field", self.field.state(), about)
+        checkpoint.save(folder / "field", self.field.state(), {**self._about(), "steps": self.spent_steps})
         _write_lines(folder / "series.jsonl", self.rows)
         _write_lines(folder / "processes.jsonl", self._processes)
         write_json(folder / "edge.json", self._status())
         if self._shown is not None:
-            truth = to_unit(self._scored_views[0].image, "held-out view", WHITE)
+            truth = to_unit(self._scored_views[0].image, "held-out view", self._scorer.background)
             _write_png(folder / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
             _write_png(folder / "rendered.png", to_bytes(self._shown))
         return build_report(folder)
-
-    def _held_out(self) -> list[str]:
-        return [view.camera for view in self.data.held_out]
 
     def _about(self) -> dict[str, Any]:
         return {
@@ -231,10 +231,10 @@ class Fit(ViewedField):
                 "file": d.file.name,
                 "instant": d.instant,
                 "training": len(d.training),
-                "held_out": self._held_out(),
+                "held_out": [v.camera for v in d.held_out],
                 "missing": d.missing,
             },
-            "baseline": mean_baselines(d.training, d.held_out, WHITE),
+            "baseline": mean_baselines(d.training, d.held_out, self._scorer.background),
             "lpips_missing": self.lpips_missing,
             "lpips_network": None if self.lpips_missing else "alex",
         }

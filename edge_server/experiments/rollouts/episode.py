@@ -165,7 +165,7 @@ class EpisodeFactory:
             if scene.moving and not self._moving:
                 self._period_ns = round(scene.period_s * 1e9)
         lpips = None if edge.lpips == "none" else open_lpips(folders.lpips)[0]
-        self._scorer = Scorer(lpips)
+        self._scorer = Scorer(lpips, edge.background)
         self.setting, self.folders = setting, folders
         # Of each the last is kept, with its images.
         self._stage_of, self._field_of = lru_cache(1)(self._open_stage), lru_cache(1)(self._make_field)

@@ -71,7 +71,7 @@ def build_deployment(
         updater,
         settings,
         scenario.seed,
-        truth or build_truth(scenario, source, edge, scorer or Scorer(), data),
+        truth or build_truth(scenario, source, edge, scorer or Scorer(background=edge.background), data),
         on_published,
     )
 

@@ -132,7 +132,7 @@ def open_simulation(
     deployment = build_deployment(
         scenario,
         settings_of(config),
-        scorer=Scorer(metric),
+        scorer=Scorer(metric, config.background),
         data=folders.data,
         on_published=on_published,
         on_motion=camera_moves,

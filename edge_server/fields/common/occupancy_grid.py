@@ -73,7 +73,8 @@ class OccupancyGrid:
             mask = np.zeros(m.view.image.shape[:2], np.uint8) if m.moved is None else m.moved.astype(np.uint8)
             pool.run(count_points, row[None], self._centers, mask, seen, marked)
         self.seen[:] = seen
-        self.needed = min(self.min_views, len(store.memory))
+        # Of cameras that see nothing in common, one is enough.
+        self.needed = min(self.min_views, len(store.memory), max(int(seen.max()), 1))
         moving = (marked >= max(self.needed, 1)) & (2 * marked >= seen)
         np.maximum(self.density, np.float32(tuned.MOVING_DENSITY * tuned.EMPTY_DENSITY), out=self.density, where=moving)
         self.update_occupied()

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.kernels.plane_sweep import NOT_SEEN
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.plane_sweep import empty_color, foreground_mask, score_grid, sweep_depths
 from edge_server.fields.common.scene_box import SceneBox
@@ -54,6 +56,8 @@ def seed_gaussians(
     local = drawn - data.first[view_of]
     cells = settings.seed_cells
     scores = score_grid(settings, pool, box, views, moved, data, cells)
+    if moved is None and (scores <= NOT_SEEN).all():  # cameras that see nothing in common
+        scores = score_grid(replace(settings, min_views=1), pool, box, views, moved, data, cells)
     distance = sweep_depths(pool, box, data, view_of, local, scores, cells)
     found = np.flatnonzero(distance > 0)[:count]
     params = np.zeros((found.size, width), np.float32)

@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from edge_server.fidelity.baselines import BaselineMean, baseline, mean_color_db
-from edge_server.fidelity.images import to_bytes
+from edge_server.fidelity.images import opaque, to_bytes
 from edge_server.fidelity.scorer import Score, Scorer, mean_score
 from edge_server.fidelity.so_far import FrameScore, so_far
 from edge_server.fields import Snapshot, View
@@ -238,10 +238,10 @@ class ScoringThread:
                 continue
             scores = self._open[publication.number]
             scores.append(each.score)
-            truth = each.truth.image()
+            truth, over = each.truth.image(), self._scorer.background
             if publication.number % tuned.BASELINE_EVERY == 0 and self._views:
-                self.baselines.add(baseline(self._views, truth, each.truth.frame.pose.matrix()))
-            comparison = Comparison(each.score.camera, truth[..., :3], to_bytes(each.rendered), publication.number)
+                self.baselines.add(baseline(self._views, truth, each.truth.frame.pose.matrix(), over))
+            comparison = Comparison(each.score.camera, opaque(truth, over), to_bytes(each.rendered), publication.number)
             final = len(scores) == len(self._held_out)
             self._on_scored(publication.scored(mean_score(scores)), comparison, final)
             if final:
@@ -256,10 +256,11 @@ class ScoringThread:
         if score is None:
             return
         turn, left = divmod(self._selected_scored, tuned.BASELINE_EVERY)
+        over = self._scorer.background
         self._selected_scored += 1
         if left == 0:
             one_of_them = whole[turn % len(whole)]  # in turn: the mean is that of all
-            self.baselines.add(Baseline(mean_color_db([v.image for v in whole], one_of_them.image)))
+            self.baselines.add(Baseline(mean_color_db([v.image for v in whole], one_of_them.image, over)))
         camera, image, truth = renderings[0]
-        comparison = Comparison(camera, truth[..., :3], to_bytes(image), publication.number)
+        comparison = Comparison(camera, opaque(truth, over), to_bytes(image), publication.number)
         self._on_scored(publication.scored(score), comparison, True)

@@ -115,7 +115,9 @@ def test_splats_stand_as_viewers_expect_them(tmp_path, sh_degree):
         np.testing.assert_allclose(shown, ours, atol=1e-5)
 
 
-@pytest.mark.parametrize(("sh_degree", "radius_m", "off_m"), [(1, 2.5, 2**-13), (0, 4e6, 4e6 * 2**-20)])
+@pytest.mark.parametrize(
+    ("sh_degree", "radius_m", "off_m"), [(1, 2.5, 2**-13), (0, 4e6, 4e6 * 2**-20), (0, 0.01, 2**-19)]
+)
 def test_splats_come_back_from_spz(tmp_path, sh_degree, radius_m, off_m):
     gsply = pytest.importorskip("gsply", reason="gsply is not installed (extra spz)")
     params = RNG.uniform(-1.0, 1.0, (30, 14 + 9 * sh_degree)).astype(np.float32)

@@ -178,6 +178,15 @@ def test_views_of_no_weight_at_all_break_nothing(name: str) -> None:
     reaches(name, "after no weights", mean_psnr(field, views))  # it goes on learning
 
 
+@each_kind
+def test_cameras_that_see_nothing_in_common_show_what_each_saw(name: str) -> None:
+    front = replace(VIEWS[0], image=np.random.default_rng(0).integers(0, 256, (24, 24, 3), dtype=np.uint8))
+    behind = replace(front, camera="behind", camera_to_world=front.camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+    field = tiny(name)
+    field.fit([front, behind], Budget(steps=40))
+    assert field.render(front.camera_to_world, front.intrinsics).opacity.mean() > 0.3
+
+
 # One camera sends what cannot be in one update: 30 updates later the field is as good as one that never saw it.
 STEPS, WARM, AFTER = 4, 40, 30  # of an update; updates before and after the poison
 WITHIN_DB = 0.5

@@ -275,6 +275,11 @@ def test_where_nothing_is_held_out_the_mean_color_is_that_of_the_views() -> None
     ((scored, final),) = told
     assert final and thread.baselines.mean.nearest_view_db is None
     np.testing.assert_allclose([scored.psnr_db, thread.baselines.mean.mean_color_db], 20.0, atol=1e-3)
+    clear, shown = np.zeros((SIDE, SIDE, 4), np.uint8), []  # transparent: as bright as what lies behind
+    white = ScoringThread([], Scorer(background=(1.0, 1.0, 1.0)), lambda *of: shown.append(of[1].truth), print)
+    white._score_selected(publication(500), brightness(500 * MS), [replace(views[0], image=clear), views[0]])
+    np.testing.assert_allclose(white.baselines.mean.mean_color_db, -20 * np.log10(0.3), atol=1e-3)
+    assert shown[0].shape == (SIDE, SIDE, 3) and (shown[0] == 255).all()
 
 
 def test_of_a_held_out_camera_that_moves_the_newest_frame_and_all_so_far_are_told_apart() -> None:

@@ -148,6 +148,7 @@ class PoseCorrections:
     def forget(self, camera: str) -> None:
         """Forget a view's correction."""
         del self.known[camera]
+        self._ranks.pop(camera, None)
         self._sorted = {}
 
     def newest(self, track: str, count: int) -> list[PoseCorrection]:
@@ -232,6 +233,8 @@ class PoseCorrections:
             slopes[k] = (render(moved, points) - here) / 0.5  # per pixel's worth of motion
         error = here - seen
         robust = 1.0 / (1.0 + (np.square(error).sum(axis=1, keepdims=True) / tuned.OUTLIER**2))
+        if view.weight is not None:
+            robust *= view.weight[row, column, None]
         # Sums by einsum without BLAS: its order of summation depends on the number of threads.
         total = np.concatenate([known.rotation, known.shift_m]) / scale
         hessian = np.einsum("inc,jnc,nk->ij", slopes, slopes, robust, optimize=False) / tuned.PIXELS

@@ -128,6 +128,8 @@ def test_a_step_moves_the_views_taken_around_it_but_not_those_without_times() ->
         for one in (poses, again):
             one.descend(views[1], np.full(6, -3.0), normal, WALL_M / LENS.fx)
         assert again.meta() == poses.meta()
+        again.forget("v07")
+        assert "v07" not in again._ranks, "a carried camera forgets views for as long as it runs"
 
 
 @pytest.mark.stability
@@ -180,6 +182,16 @@ def test_a_step_by_rendered_colors_is_gauss_newtons_and_its_mean_is_taken_from_a
     for view, share in ((gray, -0.4), (SEEN[1], 0.4)):
         known = poses.known[view.camera]
         assert np.concatenate([known.rotation, known.shift_m]) == pytest.approx(share * step * scale, rel=1e-6)
+    there = np.arange(lens.height * lens.width).reshape(lens.height, lens.width) % 3 > 0
+    found = []
+    for masked in (128, 255):
+        poses = PoseCorrections(1.0, 60.0)
+        poses.pose(SEEN[1])
+        image = np.where(there[..., None], gray.image, np.uint8(masked))
+        view = replace(gray, image=image, weight=there.astype(np.float32))
+        poses.correct(view, render, 0.01, np.random.default_rng(0), np.zeros(3, np.float32))
+        found.append(poses.pose(view))
+    np.testing.assert_array_equal(*found, err_msg="what a mask leaves out says nothing of the pose")
 
 
 def arm_poses(count: int = 40) -> list[np.ndarray]:
