@@ -274,9 +274,6 @@ def source_config(scenario: Scenario) -> SourceConfig:
         for key, named in (("devices", getattr(config, "devices", {})), ("trajectory.files", files)):
             if unknown := [camera for camera in named if camera not in scenario.cameras]:
                 raise ScenarioError(f"{where}.{key}.{unknown[0]}: not a camera of this scenario")
-        devices = [str(device) for device in getattr(config, "devices", {}).values()]
-        if doubles := [device for device in devices if devices.count(device) > 1]:
-            raise ScenarioError(f"{where}.devices: more than one camera is {doubles[0]}")
     if scenario.phase != "locked" and not isinstance(config, WorldConfig):
         raise ScenarioError(
             f"{scenario.path}: cameras.phase: {scenario.phase} is for source.kind world alone, others capture when "

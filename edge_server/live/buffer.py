@@ -69,6 +69,7 @@ class FrameBuffer:
                 self._unselected = (
                     {camera: deque(maxlen=tuned.MOST_UNSELECTED) for camera in self.cameras} if wanted else None
                 )
+                self._held, self.held_back = Counter(), 0
 
     def take(
         self, selected: Sequence[Frame], most: int | None = None, moving: Mapping[str, float] | None = None

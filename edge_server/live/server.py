@@ -41,7 +41,7 @@ from edge_server.scheduler import LivePolicies, short_name
 from edge_server.settings import EdgeConfig, cameras_move, described, embedding_for, read_config
 from freshfield.clock import WallClock
 from freshfield.files import read_status, write_json
-from freshfield.ledger import Ledger
+from freshfield.ledger import Ledger, LedgerReader
 from freshfield.scenario import Scenario, ScenarioError
 from freshfield.transport import Transport, host_port
 from freshfield.untrusted import stored_bytes
@@ -213,10 +213,11 @@ class EdgeServer:
             self.state.warnings = self._warnings()
             self.scoring.load()  # before frames come: they would wait for it
             grpc.start()
-        except BaseException:  # nothing was served, and edge.json stays that of an earlier run
-            self._close_records()
+        except BaseException:
+            self._leave_no_trace()
             raise
         opened: list[OpenPage] = []
+        served = False
         try:
             for name, start in (("page", self.options.open_page), ("Foxglove", self.options.open_foxglove)):
                 if start is not None:
@@ -229,6 +230,7 @@ class EdgeServer:
                     self.state, self.ingest, self.options.page_host, self.options.metrics_port, self.options.transport
                 )
             self.journal.begin()
+            served = True
             self.scoring.start()
             self.loop.start()
             self._watch()
@@ -238,7 +240,7 @@ class EdgeServer:
             self._write_field()  # first: who asked for the end does not wait for ever
             self.scoring.stop(tuned.LAST_SCORES_S)
             grpc.join(tuned.GRPC_END_S)
-            self._write_final()
+            self._write_final() if served else self._leave_no_trace()
             for page in opened:
                 page.stop()
         if self.loop.failure is not None:
@@ -442,6 +444,16 @@ class EdgeServer:
                 self._close_records()
             finally:
                 self.journal.close()
+
+    def _leave_no_trace(self) -> None:
+        """Close the files of a start that served nothing: edge.json, and with it the report, stay those of an earlier
+        run. A ledger without a frame goes."""
+        try:
+            self._close_records()
+            if all(each.event == "closed" for each in LedgerReader(self.ledger.path)):
+                self.ledger.path.unlink()
+        finally:
+            self.journal.close(with_status=False)
 
     def _close_records(self) -> None:
         try:

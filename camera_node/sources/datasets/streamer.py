@@ -80,7 +80,8 @@ def open_recorded(
             f"{path}: has masks of pixels that must not be learned from, which a stream cannot carry: use edge-server "
             "fit, or leave the masks out"
         )
-    if wrong := [name for name in config.assignment.values() if name not in found.cameras]:
+    named = [config.assignment[camera] for camera in cameras if camera in config.assignment]
+    if wrong := [name for name in named if name not in found.cameras]:
         there = ", ".join(found.cameras) or "none that has a name"
         raise ScenarioError(f"{scenario.path}: source.assignment: the data has no camera {wrong[0]!r} (it has {there})")
     path_of_one = len(scenario.cameras) == 1 == len(found.cameras) and all(image.time_s is not None for image in found)

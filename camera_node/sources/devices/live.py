@@ -184,6 +184,10 @@ def open_live(
         for camera in cameras:
             if camera not in config.devices:
                 raise ScenarioError(f"{scenario.path}: source.devices.{camera}: missing: which camera is it?")
+    # Of the cameras of this node: another machine's may have the same number.
+    devices = [str(config.devices[camera]) for camera in cameras if camera in config.devices]
+    if doubles := [device for device in devices if devices.count(device) > 1]:
+        raise ScenarioError(f"{scenario.path}: source.devices: more than one camera is {doubles[0]}")
     fps, clock = rate(config.fps or tuned.LIVE_FPS), WallClock()
     known = calibrations(scenario, config) if any_fov_deg is None else {}
     standing = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))

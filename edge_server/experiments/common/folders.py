@@ -27,9 +27,12 @@ class Folders:
     def files_of(self, scenario: Scenario) -> list[Path]:
         """Existing files and folders that a scenario's results depend on: its data set, the files that its channel,
         its source (poses) and its edge (models) name, and the weights of LPIPS."""
-        texts = _texts([scenario.channel, scenario.source, scenario.edge])
-        named = [file for text in texts if (file := scenario.path.parent / Path(text).expanduser()).is_file()]
-        paths = dict.fromkeys((self.data_of(scenario), *named, self.lpips))
+        data, beside = self.data_of(scenario), [scenario.path.parent]
+        if data is not None:  # poses of a video lie there
+            beside.append(data if data.is_dir() else data.parent)
+        texts = [Path(text).expanduser() for text in _texts([scenario.channel, scenario.source, scenario.edge])]
+        named = [file for folder in beside for text in texts if (file := folder / text).is_file()]
+        paths = dict.fromkeys((data, *named, self.lpips))
         return [path for path in paths if path is not None and path.exists()]
 
     def data_of(self, scenario: Scenario) -> Path | None:

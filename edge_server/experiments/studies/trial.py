@@ -31,6 +31,7 @@ from edge_server.fidelity.scorer import SHOWN, Scorer
 from edge_server.fields.registry import make_field
 from edge_server.live.state import Publication
 from edge_server.scheduler.learned.rewards import f_w
+from edge_server.settings import read_config
 from freshfield.scenario import Scenario, ScenarioError, load, parse, seed_sequence
 
 # Scenes whose name differs from that of their scenario.
@@ -320,4 +321,5 @@ def _stage(stage: tuple[Any, ...], lpips: bool, folders: Folders) -> Stage:
     scene, size, scale, cameras, speed = stage
     trial = Trial(scene, 0, {"preset": "ideal"}, size=size, scale=scale, cameras=cameras, speed_m_per_s=speed)
     scenario = trial.scenario()
-    return open_stage(scenario, Scorer(open_lpips(folders.lpips)[0] if lpips else None), folders)
+    metric = open_lpips(folders.lpips)[0] if lpips else None
+    return open_stage(scenario, Scorer(metric, read_config(scenario).background), folders)

@@ -14,6 +14,7 @@ from msgspec.structs import asdict
 from camera_node.capture import Camera
 from edge_server.experiments.experiment_constants import RESCORED_EVERY_S, RESCORES_COUNT_FROM_S
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
+from edge_server.fidelity.images import Color, opaque
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fidelity.so_far import score_frame, so_far
 from edge_server.fields import View
@@ -24,12 +25,14 @@ from freshfield import payload
 class NowAndAll:
     """Watches a deployment before it runs. rows: seconds since the run began, and the scores then.
 
-    cameras: the held-out cameras, opened. seconds: how long it will run.
+    cameras: the held-out cameras, opened. seconds: how long it will run. background: behind transparent images.
     """
 
-    def __init__(self, deployment: VirtualDeployment, cameras: Sequence[Camera], seconds: float) -> None:
+    def __init__(
+        self, deployment: VirtualDeployment, cameras: Sequence[Camera], seconds: float, background: Color
+    ) -> None:
         self.rows: list[tuple[float, SoFarScores]] = []
-        self._deployment, self._scorer = deployment, Scorer()
+        self._deployment, self._scorer = deployment, Scorer(background=background)
         self._frames: list[View] = []
         for camera in cameras:
             schedule, tick = camera.rate_schedule, 0
@@ -52,7 +55,8 @@ class NowAndAll:
     def _take(self, camera: Camera, tick: int) -> None:
         shot = camera.capture(tick)
         lens = shot.intrinsics
-        image = payload.decode(shot.payload, camera.codec, lens.width, lens.height)[..., :3]
+        image = payload.decode(shot.payload, camera.codec, lens.width, lens.height)
+        image = opaque(image, self._scorer.background)
         self._frames.append(View(camera.name, image, shot.pose.matrix(), lens, self._deployment.clock.now_ns()))
 
     def _mark(self, t_s: float) -> None:

@@ -88,12 +88,13 @@ def _simulate(args: argparse.Namespace) -> None:
     deployment, missing = open_simulation(scenario, folders, lambda new: _settings(new, args), say, published)
     if args.out is not None:
         for earlier in (args.out / "decisions").glob("*.npz"):  # of another run in this folder: explain would take them
-            earlier.unlink()
+            if earlier.stem.isdigit() or earlier.stem.startswith("policy-"):
+                earlier.unlink()
         decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
     watched = None
     if scenario.held_out_every:
         kept = build_cameras(scenario, source_config(scenario), scenario.held_out, folders.data)
-        watched = NowAndAll(deployment, kept, args.seconds)
+        watched = NowAndAll(deployment, kept, args.seconds, config.background)
     _run(deployment, args.seconds, quiet=args.json)
     found = {**summary(scenario, deployment, args.seconds), "field": config.field, "chosen": chosen[-1]}
     if missing:

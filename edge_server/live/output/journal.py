@@ -99,13 +99,15 @@ class Journal:
                 log.warning("%s: cannot be written (%s)", self._out / "edge.json", error.strerror or error)
             self._status_failed = True
 
-    def close(self) -> None:
+    def close(self, with_status: bool = True) -> None:
+        """Write what is open, and a last status unless another run's is to stay."""
         with self._lock:
             while self._open:
                 self._write_oldest()
             for file in self._files.values():
                 file.close()
-        self.write_status()
+        if with_status:
+            self.write_status()
 
     def _write_oldest(self) -> None:
         """Write a line for the oldest publication, unless it has no scores and lines would be too frequent.

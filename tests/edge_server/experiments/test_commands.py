@@ -75,6 +75,11 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
     named = [tmp_path / name for name in ("mine.yaml", "delays.txt", "poses.tum", "yolo.onnx")]
     for file in named[2:]:
         file.write_bytes(b"")
+    far = replace(recorded, source={**source, "data": "far"})  # a video's poses lie beside its calibration
+    (tmp_path / "sets" / "far").mkdir(parents=True)
+    (tmp_path / "poses.tum").rename(tmp_path / "sets" / "far" / "poses.tum")
+    assert tmp_path / "sets" / "far" / "poses.tum" in Folders(tmp_path / "sets").files_of(far)
+    (tmp_path / "poses.tum").write_bytes(b"")
     for data in (tmp_path, None):  # data beside the scenario need no folder
         assert Folders(data).files_of(recorded) == named
     assert read_channel(str(tmp_path / "whole.yaml"))[0] == found

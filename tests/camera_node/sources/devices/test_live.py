@@ -19,7 +19,7 @@ from camera_node.sources.devices.feed import CameraError, Plugged, select_device
 from camera_node.sources.devices.live import LiveSource
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole
-from freshfield.scenario import load, parse
+from freshfield.scenario import ScenarioError, load, parse
 from tests.camera_node.depth_source import POSE
 from tests.camera_node.sources.devices.mjpeg import SIZE, NetworkCamera, camera_file, number_of
 from tests.support import patiently, refused, wait_until
@@ -133,6 +133,10 @@ def test_a_camera_that_fails_leaves_no_other_one_open(tmp_path, monkeypatch):
     monkeypatch.setattr(live, "_poses", lambda *_: {"eye": arm, "other": STANDING})
     monkeypatch.setattr(live, "open_feed", open_feed)
     refused(CameraError, "other: no camera", live.open_live, plan, source_config(plan), plan.cameras)
+    source["devices"] = {"eye": 0, "other": "0"}
+    twice = parse({"cameras": {"ids": ["eye", "other"]}, "source": source}, plan.path)
+    refused(ScenarioError, "more than one camera is 0", live.open_live, twice, source_config(twice), twice.cameras)
+    live.open_live(twice, source_config(twice), ["eye"])["eye"].close()  # the other is another machine's
     assert first.closed and arm.close.called
     assert "camera eye" not in [thread.name for thread in threading.enumerate()]
 
