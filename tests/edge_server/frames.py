@@ -21,7 +21,7 @@ def tiny_field(seed: int = 0):
 
 def frame(camera: str = "cam01", sequence: int = 0, generated_ns: int = 0, **other) -> Frame:
     """A 32 x 24 JPEG frame of ``camera``; ``other`` overrides any field of Frame."""
-    image = np.full((24, 32, 3), 40 + 10 * (sequence % 20), np.uint8)
+    image = np.full((24, 32, 3), 40 + 10 * abs((sequence + 20) % 40 - 20), np.uint8)  # no jump
     image[4:12, 6:20, 0] = 220
     pose = Pose.from_matrix(look_at([2.0, 0.0, 1.0], [0.0, 0.0, 0.0]))
     taken = Frame(camera, "s1", sequence, generated_ns, pose, CAMERA, "jpeg", payload.encode(image))

@@ -6,6 +6,7 @@ import tracemalloc
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
@@ -116,6 +117,12 @@ def test_a_wide_value_takes_no_more_than_itself():
     wide = [[0] * 1000] * 1000
     refused(UntrustedError, "", untrusted.refuse_expansion, wide, 5000, lambda v: v if isinstance(v, list) else ())
     untrusted.refuse_expansion(wide, 1_001_001, lambda v: v if isinstance(v, list) else ())
+
+
+def test_an_uncompressed_archive_holds_no_more_than_its_size(tmp_path):
+    np.savez(tmp_path / "a.npz", a=np.zeros(1000))
+    assert 8000 < untrusted.stored_bytes(tmp_path / "a.npz") < 9000 and untrusted.stored_bytes(tmp_path / "none") == 0
+    assert work_ms(lambda: untrusted.stored_bytes(tmp_path / "a.npz")) < 5
 
 
 def test_what_has_no_end_is_not_read(tmp_path):

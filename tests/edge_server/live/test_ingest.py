@@ -28,9 +28,9 @@ MS = 1_000_000
 
 @pytest.fixture
 def ingest(tmp_path):
-    ledger = Ledger(tmp_path, "edge", "edge", NOW)
-    made = Ingest(VirtualClock(NOW), FrameBuffer(["cam01"]), ["cam00"], ledger, lambda frame: None, max_side_px=128)
-    made.test_ledger = ledger
+    held, ledger = [], Ledger(tmp_path, "edge", "edge", NOW)
+    made = Ingest(VirtualClock(NOW), FrameBuffer(["cam01"]), ["cam00"], ledger, held.append, max_side_px=128)
+    made.test_held, made.test_ledger = held, ledger
     yield made
     ledger.close(NOW)
 
@@ -41,6 +41,12 @@ def good(sequence: int = 0, **other):
 
 def rejection(admission: FrameAdmission, item: Frame) -> str:
     return refused(FrameRejected, "", admission.admit, item, NOW).reason
+
+
+def test_held_out_frames_never_reach_the_training_buffer(ingest):
+    assert ingest.take(to_request(good(camera="cam00", held_out=True))).outcome == pb.OUTCOME_ACCEPTED
+    assert [f.camera for f in ingest.test_held] == ["cam00"]
+    assert ingest.buffer.newest() == {}
 
 
 def sent(change: Callable[[pb.FrameHeader], None] = lambda header: None, **wrong: Any) -> pb.PushRequest:

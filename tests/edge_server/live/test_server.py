@@ -137,7 +137,7 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert {c for s in series for c in s["selected"]} == {"cam01", "cam02"}  # never the held-out one
     status = json.loads((out / "edge.json").read_text())
     assert status["updates"]["count"] == len(series)
-    assert status["baseline"]["mean_color_db"] > 2  # of truths a second apart on a busy machine: their light differs
+    assert status["baseline"]["mean_color_db"] > 5
     assert (out / "truth.png").exists() and (out / "rendered.png").exists()
     (ledger,) = read_all(out)
     delivered = [e for e in ledger.events if e.event == "delivered"]
