@@ -26,8 +26,8 @@ from freshfield.settings import ScenarioError, Settings, about, read_settings, w
 from freshfield.untrusted import read_json, read_text
 
 if TYPE_CHECKING:
-    from edge_server.embed import EmbeddingConfig
     from edge_server.embed.embedder import Embedder
+    from edge_server.embed.settings import EmbeddingConfig
 
 
 LEAST_UPDATE_MS = 10.0
@@ -164,7 +164,7 @@ def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:
     that policies are trained with. None where neither asks for embeddings."""
     if config.embedding is not None or policy.embedding[0] == 0:
         return config.embedding
-    from edge_server.embed import EmbeddingConfig
+    from edge_server.embed.settings import EmbeddingConfig
 
     return EmbeddingConfig()
 
@@ -190,11 +190,11 @@ def read_config(scenario: Scenario, moving: bool | None = None) -> EdgeConfig:
     elif isinstance(section.get("compute"), str):
         section["compute"] = _read_json(scenario, "compute", section["compute"]).get("compute")
     if section.get("embedding") is not None:
-        from edge_server.embed import read_embedding
+        from edge_server.embed.settings import read_embedding
 
         section["embedding"] = read_embedding(section["embedding"], scenario.path)
     if section.get("foreground") is not None:
-        from edge_server.foreground import read_foreground
+        from edge_server.foreground.settings import read_foreground
 
         section["foreground"] = read_foreground(section["foreground"], scenario.path)
     config = read_settings(EdgeConfig, section, f"{scenario.path}: edge")

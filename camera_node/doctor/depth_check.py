@@ -19,8 +19,9 @@ from camera_node.settings import SourceConfig
 from camera_node.sources.base import pixels
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
-from freshfield.depth import USUAL_M, DepthImage
+from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pinhole, Pose, se3_inverse, seen_from
+from freshfield.limits import USUAL_DEPTH_M
 from freshfield.scenario import Scenario
 
 
@@ -82,7 +83,7 @@ def check(view: DepthView, others: Sequence[DepthView]) -> str:
     said += f", {near:.2g} to {far:.2g} m"
     if np.bincount(counts[measured]).max() > tuned.DEPTH_CONSTANT * measured.sum():
         raise ValueError(f"{said}: nearly all of it is the same, {middle:.3g} m: does the sensor measure at all?")
-    if not USUAL_M[0] <= middle <= USUAL_M[1]:
+    if not USUAL_DEPTH_M[0] <= middle <= USUAL_DEPTH_M[1]:
         raise ValueError(f"{said}: is the unit wrong?")
     shares = {other.camera: _agreement(view, other)[0] for other in others}
     known = {camera: share for camera, share in shares.items() if share is not None}

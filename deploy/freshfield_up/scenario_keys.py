@@ -216,8 +216,8 @@ def _known(kind: str, built_in: Iterable[str], find: Callable[[str], Any]) -> It
 def _edge_models() -> dict[str, type[Settings]]:
     """Title -> settings of the edge; empty without the extra ``edge``."""
     try:
-        from edge_server.embed import EmbeddingConfig
-        from edge_server.foreground import ForegroundConfig
+        from edge_server.embed.settings import EmbeddingConfig
+        from edge_server.foreground.settings import ForegroundConfig
         from edge_server.settings import ComputeConfig, EdgeConfig
     except ImportError:
         return {}

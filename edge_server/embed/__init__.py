@@ -8,20 +8,17 @@ enables it; without that key this package is not imported.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
-from msgspec.structs import replace
-
-from freshfield.settings import Settings, about, read_settings, within
+from edge_server.embed.settings import DEFAULT, EmbeddingConfig
 
 if TYPE_CHECKING:
     from edge_server.embed.depth_network import DepthNetwork
     from edge_server.embed.embedder import Embedder
 
-DEFAULT = "default"
 MODELS = Path(__file__).parent / "models"
 # Its features have a mean cosine of 0.998 with those of the fp32 model, which tag v0.1-all has (detector.json).
 DETECTOR = "detector_int8.onnx"
@@ -29,22 +26,6 @@ DETECTOR = "detector_int8.onnx"
 
 class EmbeddingError(ValueError):
     """A model, setting or image is unusable; the one-line message says what, where and what to do."""
-
-
-class EmbeddingConfig(Settings, frozen=True):
-    """The section ``edge.embedding`` of a scenario."""
-
-    model: Annotated[str, about("a YOLO detection ONNX, relative to the scenario, or default")] = DEFAULT
-    dim: Annotated[int, within(1, 4096, "length of an embedding, at most the channels at the backbone's end")] = 32
-
-
-def read_embedding(mapping: Mapping[str, Any], scenario: Path) -> EmbeddingConfig:
-    """Read the section ``edge.embedding`` of file ``scenario``; raises freshfield.scenario.ScenarioError."""
-    values = dict(mapping) if isinstance(mapping, Mapping) else mapping
-    config = read_settings(EmbeddingConfig, values, f"{scenario}: edge.embedding")
-    if config.model == DEFAULT:
-        return config
-    return replace(config, model=str(scenario.parent / config.model))
 
 
 def model_path(name: str) -> Path:

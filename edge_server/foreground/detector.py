@@ -22,7 +22,7 @@ from edge_server.embed import EmbeddingError
 from edge_server.embed.backbone import exported_size
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
 from edge_server.embed.letterbox import blob, checked, placed
-from edge_server.foreground import MODELS, SHIPPED
+from edge_server.foreground.settings import MODELS, SHIPPED
 
 Array = NDArray[np.float64]
 

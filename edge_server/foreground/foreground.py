@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.embed import EmbeddingError, onnx_libraries
-from edge_server.foreground import SHIPPED, WHY, ForegroundConfig
+from edge_server.foreground import WHY
+from edge_server.foreground.settings import SHIPPED, ForegroundConfig
 
 if TYPE_CHECKING:
     from edge_server.foreground.detector import Detector

@@ -26,8 +26,8 @@ from edge_server.fields import Field, View, checkpoint
 from edge_server.fields.common.field_constants import SERVER_NICE
 from edge_server.fields.registry import make_field
 from edge_server.live import live_constants as tuned
+from edge_server.live.best_update_time import open_frontier
 from edge_server.live.field_updater import open_updater
-from edge_server.live.frontier import open_frontier
 from edge_server.live.grpc_services import GrpcThread
 from edge_server.live.ingest import Ingest, percentile
 from edge_server.live.loop import UpdateLoop

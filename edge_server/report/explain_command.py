@@ -85,7 +85,8 @@ def _regions(found: RecordedDecision, camera: str, asked: bool) -> NDArray[np.fl
 def _embedder(found: RecordedDecision) -> EmbedImages:
     if found.embedding is None:
         raise ValueError("the run does not say what embedded its frames: regions cannot be found")
-    from edge_server.embed import EmbeddingConfig, make_embedder
+    from edge_server.embed import make_embedder
+    from edge_server.embed.settings import EmbeddingConfig
 
     try:
         config = EmbeddingConfig(**found.embedding)

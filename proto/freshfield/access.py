@@ -75,6 +75,22 @@ caller: ContextVar[Caller] = ContextVar("caller", default=ANYBODY)
 """Who makes the gRPC call that the current task serves."""
 
 
+def parse_tokens(text: str) -> dict[str, str]:
+    """Token by caller name of a token file: lines NAME TOKEN; one token alone gets the name "". Raises ValueError."""
+    lines = [line.split() for line in text.splitlines() if line.strip()]
+    tokens = {words[0] if len(words) == 2 else "": words[-1] for words in lines}
+    if not lines:
+        raise ValueError("the token file is empty")
+    if (
+        any(len(words) > 2 for words in lines)
+        or len(tokens) < len(lines)
+        or len(set(tokens.values())) < len(tokens)
+        or ("" in tokens and len(lines) > 1)
+    ):
+        raise ValueError("expected lines NAME TOKEN, names and tokens all different, or one token alone")
+    return tokens
+
+
 class Access:
     """Authenticates callers.
 

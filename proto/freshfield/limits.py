@@ -22,6 +22,9 @@ MAX_IMAGE_SIDE_PX = 4096
 METERS_PER_COUNT = (1e-6, 1.0)
 """Scale of depth in 16 bits: at the least its range is 6.5 cm, less than any sensor's, at the most 65 km."""
 
+USUAL_DEPTH_M = (0.02, 200.0)
+"""Half of an image's depth lies between these, or its unit is another: 1 m read as millimeters is 1 km or 1 mm."""
+
 MAX_DEPTH_GAP_NS = 10**10
 """Time between an image and its depth. Streams of a camera are some 100 ms apart, replays of a slow sensor seconds."""
 

@@ -20,7 +20,7 @@ import grpc
 import grpc.aio
 import numpy as np
 
-from freshfield.access import Access, is_loopback
+from freshfield.access import Access, is_loopback, parse_tokens
 from freshfield.limits import (
     GRPC_IDLE_S,
     MAX_CALLS,
@@ -281,7 +281,7 @@ def from_arguments(args: argparse.Namespace) -> Transport:
             _read(path)
     if (args.tls_cert is None) != (args.tls_key is None):
         raise TransportError("--tls-cert and --tls-key go together")
-    tokens = _tokens(args.token_file) if args.token_file else {}
+    tokens = _read_tokens(args.token_file) if args.token_file else {}
     transport = Transport(args.tls_cert, args.tls_key, args.tls_ca, tokens, args.insecure)
     # With a damaged file gRPC would retry for ever without a message.
     if args.tls_cert:
@@ -294,19 +294,11 @@ def from_arguments(args: argparse.Namespace) -> Transport:
     return transport
 
 
-def _tokens(path: Path) -> dict[str, str]:
-    lines = [line.split() for line in _read(path).decode(errors="replace").splitlines() if line.strip()]
-    tokens = {words[0] if len(words) == 2 else "": words[-1] for words in lines}
-    if not lines:
-        raise TransportError(f"{path}: the token file is empty")
-    if (
-        any(len(words) > 2 for words in lines)
-        or len(tokens) < len(lines)
-        or len(set(tokens.values())) < len(tokens)
-        or ("" in tokens and len(lines) > 1)
-    ):
-        raise TransportError(f"{path}: expected lines NAME TOKEN, names and tokens all different, or one token alone")
-    return tokens
+def _read_tokens(path: Path) -> dict[str, str]:
+    try:
+        return parse_tokens(_read(path).decode(errors="replace"))
+    except ValueError as error:
+        raise TransportError(f"{path}: {error}") from None
 
 
 def _read(path: Path) -> bytes:

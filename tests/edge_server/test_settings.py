@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from edge_server.edge_constants import MOST_CARRIED
-from edge_server.embed import EmbeddingConfig
+from edge_server.embed.settings import EmbeddingConfig
 from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.machine import machine
 from edge_server.progress import ProgressLine

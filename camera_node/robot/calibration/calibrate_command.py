@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from pathlib import Path
 from typing import Any
@@ -178,22 +177,13 @@ def _intrinsics(args: argparse.Namespace) -> int:
 
 def _target(args: argparse.Namespace) -> int:
     import cv2
-    import numpy as np
 
-    from camera_node.robot.calibration.targets import parse_target
+    from camera_node.robot.calibration.targets import draw_for_print, parse_target
 
     board = parse_target(args.board)
-    sides = [side_m / 0.0254 * args.dpi for side_m in board.size_m]
-    if not 64 <= sides[0] <= 32_000:
-        raise CalibrationError(f"--dpi: makes a picture {sides[0]:.0f} pixels wide, expected 64 to 32000")
-    width, height = map(round, sides)
-    # Draw finer, with whole pixels per module, then scale. Otherwise the modules' rounding errors add up.
-    fine = board.draw(board.modules * math.ceil(2 * width / board.modules))
-    image = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
-    # Detectors need a white border.
-    border = max(8, width // 10)
+    image = draw_for_print(board, args.dpi)
     out = str(args.out)
-    if not (cv2.haveImageWriter(out) and cv2.imwrite(out, np.pad(image, border, constant_values=255))):
+    if not (cv2.haveImageWriter(out) and cv2.imwrite(out, image)):
         raise CalibrationError(f"--out: {args.out} cannot be written (does its folder exist? .png?)")
     print(
         f"{args.out}: print it at {args.dpi:g} dpi without scaling; without its white border it must measure "

@@ -10,6 +10,7 @@ x to the right, y down, z away from the viewer, meters.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -90,6 +91,18 @@ def parse_target(spec: str) -> Target:
     except (TypeError, ValueError) as error:
         why = f" ({error})" if isinstance(error, ValueError) else ""
         raise CalibrationError(f"target {spec!r}: expected for example {NOTATIONS}{why}") from None
+
+
+def draw_for_print(target: Target, dpi: float) -> GrayImage:
+    """A target in its size at ``dpi``, with the white border that detectors need. Raises CalibrationError."""
+    sides = [side_m / 0.0254 * dpi for side_m in target.size_m]
+    if not 64 <= sides[0] <= 32_000:
+        raise CalibrationError(f"--dpi: makes a picture {sides[0]:.0f} pixels wide, expected 64 to 32000")
+    width, height = map(round, sides)
+    # Draw finer, with whole pixels per module, then scale. Otherwise the modules' rounding errors add up.
+    fine = target.draw(target.modules * math.ceil(2 * width / target.modules))
+    image = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
+    return np.pad(image, max(8, width // 10), constant_values=255)
 
 
 def estimate_pose(corners: Corners, lens: Pinhole) -> Array:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from edge_server.experiments.common.tables import markdown_table, number
 from edge_server.experiments.frontier.update_time import best, field_label
-from edge_server.live.frontier import best_point, points_of
+from edge_server.live.best_update_time import best_point, points_of
 from edge_server.matplotlib_figures import CYCLE, INK, figure
 from edge_server.settings import LEAST_UPDATE_MS
 

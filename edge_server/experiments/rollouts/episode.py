@@ -175,7 +175,8 @@ class EpisodeFactory:
         self.embedder: Embedder | None = None
         if "semantics" in setting.parts:
             # Loaded only where the state includes semantics.
-            from edge_server.embed import EmbeddingConfig, make_embedder
+            from edge_server.embed import make_embedder
+            from edge_server.embed.settings import EmbeddingConfig
 
             self.embedder = make_embedder(edge.embedding or EmbeddingConfig())
 

@@ -158,7 +158,7 @@ def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
     Raises ValueError if no embedder is available."""
     if "semantics" not in parts:
         return StateLayout(parts)
-    from edge_server.embed import EmbeddingConfig
+    from edge_server.embed.settings import EmbeddingConfig
 
     embedder = open_embedder(read_config(setting.scenario).embedding or EmbeddingConfig())
     assert embedder is not None

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from camera_node.settings import RecordedConfig, SourceConfig, WorldConfig, find_data, source_config
 from camera_node.synthetic.scene import Scene
-from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+from edge_server.embed import EmbeddingError, make_embedder
+from edge_server.embed.settings import EmbeddingConfig
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.experiments.virtual.from_scenario import exact_scene

@@ -9,7 +9,7 @@ from edge_server.scheduler import Policy
 from freshfield.settings import as_mapping
 
 if TYPE_CHECKING:  # imported at run time only where a policy is learned
-    from edge_server.embed import EmbeddingConfig
+    from edge_server.embed.settings import EmbeddingConfig
     from edge_server.scheduler.learned.decision_record import DecisionWriter
 
 

@@ -19,8 +19,9 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from edge_server.edge_constants import MAX_GRAPH_NODES
-from edge_server.embed import EmbeddingConfig, EmbeddingError, make_embedder
+from edge_server.embed import EmbeddingError, make_embedder
 from edge_server.embed.letterbox import GRAY
+from edge_server.embed.settings import EmbeddingConfig
 from freshfield import payload
 from freshfield.geometry import Pinhole
 from tests.conftest import data_dir

@@ -18,9 +18,9 @@ from camera_node.synthetic.scene import make_scene
 from edge_server.embed import EmbeddingError
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.foreground import ForegroundConfig
 from edge_server.foreground.detector import Detection, decode
 from edge_server.foreground.foreground import Foreground, make_foreground
+from edge_server.foreground.settings import ForegroundConfig
 from freshfield.geometry import Pinhole, on_sphere
 from freshfield.scenario import parse
 from tests.conftest import case_dir

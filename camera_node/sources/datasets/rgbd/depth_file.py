@@ -15,8 +15,9 @@ from camera_node.sources.datasets.image_reading import decode_file, read_numbers
 from camera_node.sources.datasets.lens import Lens, pinhole, undistort
 from camera_node.sources.datasets.photo import Photo
 from camera_node.sources.datasets.records import DatasetError
-from freshfield.depth import USUAL_M, DepthImage
+from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
+from freshfield.limits import USUAL_DEPTH_M
 
 import cv2  # isort: skip
 
@@ -61,7 +62,7 @@ def to_counts(
     unit = unit_m or (1.0 if values.dtype.kind == "f" else MILLIMETER)
     measured = np.isfinite(values) & (values > 0) & (values != nothing)
     middle_m = float(np.median(values[measured])) * unit if measured.any() else 1.0
-    if not USUAL_M[0] <= middle_m <= USUAL_M[1]:
+    if not USUAL_DEPTH_M[0] <= middle_m <= USUAL_DEPTH_M[1]:
         raise DatasetError(
             f"{where}: the median of its depth is {middle_m:.3g} m, if a 1 in it is {unit:g} m: say the unit of its "
             "numbers in meters (depth_unit_scale_factor of a transforms.json)"

@@ -10,7 +10,7 @@ from edge_server.cli import main as edge_server
 from edge_server.experiments.frontier import from_scratch, frontier_command, update_time
 from edge_server.experiments.frontier.output import draw_frontier, draw_updates, recommendation
 from edge_server.experiments.virtual import costs_command
-from edge_server.live.frontier import best_point, read_frontier
+from edge_server.live.best_update_time import best_point, read_frontier
 from edge_server.matplotlib_figures import CYCLE
 from edge_server.run_records import FrontierPoint
 from edge_server.settings import ComputeConfig
