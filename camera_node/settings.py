@@ -18,7 +18,6 @@ from msgspec import field
 
 from camera_node.node_constants import MAX_GAP_MS, MAX_STAMP_S
 from camera_node.robot.arm.settings import ArmConfig
-from camera_node.sources.source_constants import FIRST_FRAME_S
 from freshfield import plugins
 from freshfield.limits import MAX_IMAGE_SIDE_PX
 from freshfield.payload import DEFAULT_CODEC
@@ -31,6 +30,11 @@ if TYPE_CHECKING:
 Background = Literal["white", "black", "keep"]
 FPS_RANGE = (0.01, 1000.0)
 """Bounds of a rate of captures or of a recording, frames a second."""
+# Captures a second where a scenario gives no rate: of a synthetic world, of a device, of photos without times.
+WORLD_FPS, LIVE_FPS, PHOTO_FPS = 15.0, 15.0, 10.0
+FIRST_FRAME_S = 3.0
+"""How long the first frame of a camera may take, where a scenario says nothing of it."""
+
 ZJU_FPS = 50.0
 """Assumed rate of ZJU-MoCap's studio, which its files do not tell."""
 MAX_LATENCY_MS = 6e4

@@ -14,6 +14,8 @@ CARRIED: dict[str, Any] = {"updates": "cycle", "update_ms": 80.0, "steps": 8}
 # Most cameras of such a scan: photos that are dealt to twelve (``fox``) are no tracks, and read 8 dB less as a scan (19
 # against 27).
 MOST_CARRIED = 4
+# Options of the field of such a scan; few pixels bound the Gaussians further.
+CARRIED_OPTIONS: dict[str, Any] = {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
 
 # --- how far a command is (progress) ---
 LONG_WORK_S = 10.0  # a stage that takes longer is announced in a pipe, too: nobody wonders about less
@@ -24,6 +26,8 @@ FIGURE_WIDTH_INCH, FIGURE_DPI = 8.4, 110  # width and resolution of every figure
 FIGURE_COLORS = 64  # in a file with curves alone: a quarter of the bytes, without a visible difference
 # Colors in a file with pictures, and rounds of k-means that keep their rare colors: a third of the bytes.
 PICTURE_COLORS, PICTURE_MEANS = 256, 3
+# Factor by which errors are brightened, in figures and on the page: one of 10 % of the range is plain to see.
+ERROR_GAIN = 4.0
 # A legend of up to so many entries stands in a row above the axes; height of that row, in points.
 LEGEND_IN_A_ROW, LEGEND_ROW_PT = 4, 20.0
 

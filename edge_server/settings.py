@@ -19,7 +19,6 @@ from edge_server import edge_constants as tuned
 from edge_server.edge_constants import LONGEST_MS
 from edge_server.fidelity.images import color_behind
 from edge_server.fields.registry import FIELD
-from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.scheduler import Policy, resolve_checkpoint
 from freshfield.scenario import Scenario
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
@@ -131,7 +130,7 @@ def with_defaults(section: Mapping[str, Any], moving: bool, cameras: int) -> dic
         found["field_options"] = options = {**options, "layers": True}
     layers = bool(options.get("layers"))
     if usual and moving and not layers and cameras <= tuned.MOST_CARRIED and "keyframes" not in found:
-        found["field_options"] = {**LIVE_OPTIONS, **options}
+        found["field_options"] = {**tuned.CARRIED_OPTIONS, **options}
         return {**tuned.CARRIED, **found}
     if moving and not layers:
         found.setdefault("keyframes", {})

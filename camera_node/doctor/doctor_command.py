@@ -28,6 +28,7 @@ from camera_node.doctor import doctor_constants as tuned
 from camera_node.pose.providers import Closable, PoseGapError
 from camera_node.robot.arm.settings import ArmConfig
 from camera_node.settings import (
+    LIVE_FPS,
     LiveConfig,
     McapConfig,
     RecordedConfig,
@@ -38,7 +39,6 @@ from camera_node.settings import (
 )
 from camera_node.sources.base import rate
 from camera_node.sources.devices.feed import Image
-from camera_node.sources.source_constants import LIVE_FPS
 from freshfield import transport
 from freshfield.clock import WallClock
 from freshfield.depth import DepthImage
@@ -141,12 +141,12 @@ def _source(scenario: Scenario, config: SourceConfig, data: Path | None, plan: P
         if (tracker := config.trajectory) is not None:
             yield _check("tracker", _tracker, scenario, tracker)
     if arm is not None:
-        from camera_node.robot.arm import checks
+        from camera_node.doctor import arm_check
 
-        yield _check("hand-eye", checks.hand_eye, scenario, arm)
-        yield _check("arm", checks.joint_states, arm)
+        yield _check("hand-eye", arm_check.hand_eye, scenario, arm)
+        yield _check("arm", arm_check.joint_states, arm)
         if (path := arm.path) is not None:
-            yield _check("arm's path", checks.path, scenario, arm, path)
+            yield _check("arm's path", arm_check.path, scenario, arm, path)
     if config.depth_every and arm is None and not isinstance(config, LiveConfig | McapConfig):
         yield from _depth(scenario, config, data)
     if config.kind == "mcap":

@@ -9,6 +9,11 @@ LISTEN_AT_MOST_S = 3.0  # the same of a slow camera
 JUDGED_FRAMES = 5  # least number of expected frames for judging the rate; with fewer, chance decides
 LEAST_RATE = 0.6  # least share of the frame rate asked for
 
+# --- the arm (arm_check) ---
+ARM_LISTEN_S = 0.5  # for which joint states are counted
+ARM_LEAST_STATES = 0.8  # share of the joint states asked for; with fewer, the network or the machine is busy
+ARM_LEAST_REACHED = 0.6  # share of a tour's viewpoints; with fewer, a side of the target stays unseen
+
 # --- what fixed cameras see (coverage_check) ---
 COVERAGE_TICKS = (0, 7, 30)  # ticks whose shots tell whether a camera moves that never repeats one
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from camera_node import node_constants as tuned
 from camera_node.pose.pairing import PoseGapError, SampleBuffer
-from camera_node.pose.providers import read_sample
+from camera_node.pose.trajectory_file import read_sample
 from camera_node.sources.datasets.records import DatasetError
 from freshfield.clock import Clock, SystemClock, WallClock
 from freshfield.geometry import Pose

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from camera_node.pose.providers import PoseProvider, read_tum
+from camera_node.pose.providers import PoseProvider
+from camera_node.pose.trajectory_file import read_tum
 from camera_node.settings import TrajectoryConfig, errors_of
 from freshfield.scenario import Scenario, ScenarioError
 

@@ -39,7 +39,7 @@ def open_sources(
     """
     effects = effects or {}
     if scenario.held_out_every and scenario.held_out:
-        from camera_node.sources.shared_path import check_divisible, divide
+        from camera_node.sources.held_out_captures import check_divisible, divide
 
         check_divisible(scenario, config)
         whole = replace(scenario, cameras=scenario.training, held_out=())

@@ -1,7 +1,6 @@
 """Numbers of recorded data sets and of real cameras."""
 
 # --- photos (datasets.streamer) ---
-PHOTO_FPS = 10.0  # captures a second of photos without times, where a scenario gives no rate
 HOLD_OUT_EVERY = 8  # of so many photos the first is held out, where the data set has no test images of its own
 
 # --- sizes of images (datasets.photo, datasets.dynerf, datasets.rgbd.depth_file, datasets.image_reading) ---
@@ -41,10 +40,8 @@ RECORDING_POSE_NEAR_NS = 50_000_000
 RECORDING_PARENTS_NEAR_NS = 250_000_000
 
 # --- cameras (devices.live, camera_node.doctor.doctor_command) ---
-LIVE_FPS = 15.0  # captures a second of a device where a scenario gives no rate
 # Pauses before a camera that failed is opened again: after the first failure, the second, ...
 REOPEN_AFTER_S = (0.25, 0.5, 1.0, 2.0, 5.0)
-FIRST_FRAME_S = 3.0  # how long the first frame of a camera may take, where a scenario says nothing of it
 # Longest wait of a capture for a new frame: seconds, and share of the time between two captures.
 NEXT_FRAME_S, NEXT_FRAME_PERIODS = 0.5, 0.5
 GRAB_S = 0.5  # a thread waits so long for a frame until it looks whether it is to end

@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING, cast
 import msgspec
 import numpy as np
 
-from camera_node.settings import SourceConfig, WorldConfig, errors_of
+from camera_node.settings import WORLD_FPS, SourceConfig, WorldConfig, errors_of
 from camera_node.sources.base import Shot, Source, pixels, rate
 from camera_node.synthetic import Scene, make_scene
 from camera_node.synthetic.effects import NO_EFFECTS, Effects
 from camera_node.synthetic.frame_cache import FrameCache, default_folder, renderer_version
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.render import CameraRenderer, Image
-from camera_node.synthetic.synthetic_constants import WORLD_FPS, WORLD_MAX_FRAMES
+from camera_node.synthetic.synthetic_constants import WORLD_MAX_FRAMES
 from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.geometry import Array, Pose

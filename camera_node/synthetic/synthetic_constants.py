@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 # --- captures (source) ---
-WORLD_FPS = 15.0  # captures a second where a scenario gives no rate
 # A sequence with more different frames counts as not repeating: rendered on demand and not kept.
 WORLD_MAX_FRAMES = 3000
 

@@ -8,8 +8,8 @@ import re
 from pathlib import Path
 from typing import Any
 
-from channel_emu.model.table import Column, TableError, read_table
-from freshfield.untrusted import UntrustedError, read_text, read_yaml
+from channel_emu.model.table import TableError, read_delays
+from freshfield.untrusted import UntrustedError, read_yaml
 
 _UNITS_MS = {"us": 1e-3, "ms": 1.0, "s": 1e3, "min": 6e4}
 _DISTRIBUTIONS = {
@@ -103,7 +103,10 @@ def service(text: str, folder: Path) -> dict[str, Any]:
     short, _, rest = text.partition(":")
     law = _DISTRIBUTIONS.get(short)
     if law == "trace" and rest:
-        return {"law": "trace", "delays_ms": delays_ms(folder / rest)}
+        try:
+            return {"law": "trace", "delays_ms": read_delays(folder / rest)}
+        except TableError as error:
+            raise NotationError(str(error)) from None
     if "," in text:
         parts = [service(word, folder) for word in text.split(",")]
         if len({json.dumps({k: v for k, v in part.items() if k != "mean_ms"}) for part in parts}) != 1:
@@ -140,27 +143,3 @@ def chain(text: str) -> dict[str, Any]:
                 "more states: a scenario's `chain:`"
             )
     return found
-
-
-def delays_ms(path: Path) -> list[float]:
-    """One-way delays in ms from a file: one number a line, or a table (``table``) with a header that names the
-    delay and its unit, such as ``delay_ms``. Rows that a column ``lost`` marks, or without a delay, are left out.
-
-    Raises NotationError.
-    """
-    try:
-        table = read_table(read_text(path))
-        column = table.column("delay", "latency", "one_way_delay", "owd")
-        if column is None and table.titles:
-            raise TableError(f"expected a column delay_ms (or delay_s, latency [us]); it has {', '.join(table.titles)}")
-        if any(len(row) != 1 for _, row in table.rows) and column is None:
-            raise TableError("expected one delay in ms a line, with a decimal point, or a header that names delay_ms")
-        times = table.times_ms(column or Column("the delay", 0, 1.0))
-        found = [time for time, lost in zip(times, table.lost()) if not lost and not math.isnan(time)]
-        if not found:
-            raise TableError("holds no delay")
-        return found
-    except TableError as error:
-        raise NotationError(f"{path}: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise NotationError(f"{path}: cannot be read: {error}") from None

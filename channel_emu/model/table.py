@@ -8,6 +8,9 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
+
+from freshfield.untrusted import read_text
 
 UNITS_MS = {"ns": 1e-6, "us": 1e-3, "µs": 1e-3, "μs": 1e-3, "ms": 1.0, "msec": 1.0, "s": 1e3, "sec": 1e3}
 UNITS_MS |= {"nanoseconds": 1e-6, "microseconds": 1e-3, "milliseconds": 1.0, "seconds": 1e3}
@@ -116,6 +119,30 @@ def read_table(text: str) -> Table:
     if commas and all(_THOUSANDS.fullmatch(word) for word in commas):
         raise TableError(f"{commas[0]} may be thousands or have three decimals: write decimal points, or no commas")
     return Table(titles, tuple((k, row + ("",) * (width - len(row))) for k, row in rows))
+
+
+def read_delays(path: Path) -> list[float]:
+    """One-way delays in ms from a file: one number a line, or a table with a header that names the delay and its unit,
+    such as ``delay_ms``. Rows that a column ``lost`` marks, or without a delay, are left out.
+
+    Raises TableError, which names the file.
+    """
+    try:
+        table = read_table(read_text(path))
+        column = table.column("delay", "latency", "one_way_delay", "owd")
+        if column is None and table.titles:
+            raise TableError(f"expected a column delay_ms (or delay_s, latency [us]); it has {', '.join(table.titles)}")
+        if any(len(row) != 1 for _, row in table.rows) and column is None:
+            raise TableError("expected one delay in ms a line, with a decimal point, or a header that names delay_ms")
+        times = table.times_ms(column or Column("the delay", 0, 1.0))
+        found = [time for time, lost in zip(times, table.lost()) if not lost and not math.isnan(time)]
+        if not found:
+            raise TableError("holds no delay")
+        return found
+    except TableError as error:
+        raise TableError(f"{path}: {error}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise TableError(f"{path}: cannot be read: {error}") from None
 
 
 def _fields(line: str, separator: str | None) -> tuple[str, ...]:

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from freshfield.scenario import ScenarioError
 from freshfield_up import check_plugin, scenario_command
-from freshfield_up.commands import MissingCommand, Options
 from freshfield_up.folder import FolderError
 from freshfield_up.launcher import open_launcher
+from freshfield_up.process_set import MissingCommand, Options
 
 EXAMPLES = """examples:
   freshfield demo                              the default scenario for a minute, page on http://127.0.0.1:8080

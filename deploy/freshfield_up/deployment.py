@@ -16,9 +16,9 @@ from typing import Any
 
 from freshfield.files import read_status
 from freshfield_up import launcher_constants as tuned
-from freshfield_up.commands import Options
 from freshfield_up.launcher import open_launcher
 from freshfield_up.ports import LOOPBACK, free_ports
+from freshfield_up.process_set import Options
 
 
 class DeploymentError(RuntimeError):

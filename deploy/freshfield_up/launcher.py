@@ -22,7 +22,7 @@ from freshfield.scenario import Scenario, ScenarioError
 from freshfield_up import console, folder, ports
 from freshfield_up import launcher_constants as tuned
 from freshfield_up.child_process import Child, kill, stop
-from freshfield_up.commands import Options, ProcessSet, process_set, program
+from freshfield_up.process_set import Options, ProcessSet, process_set, program
 from freshfield_up.status import status_line, summarize
 
 _LOADING, _COMPILING = "loading", "compiling"

@@ -126,14 +126,14 @@ class Exporter:
 
     def _colmap(self, folder: Path) -> None:
         from edge_server.export.colmap import write_model
-        from edge_server.export.images import write_images
+        from edge_server.export.images_and_video import write_images
 
         write_model(folder / "sparse" / "0", self._shots, self.cloud)
         write_images(folder / "images", self._shots)
         self._say(f"{folder}: {len(self._shots)} images, {len(self.cloud.points)} points")
 
     def _transforms(self, folder: Path) -> None:
-        from edge_server.export.images import write_images
+        from edge_server.export.images_and_video import write_images
         from edge_server.export.transforms import write_transforms
 
         write_images(folder / "images", self._shots)

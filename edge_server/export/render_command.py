@@ -15,7 +15,7 @@ from edge_server.command import command_parser, exit_status
 from edge_server.export import ExportError
 from edge_server.export import export_constants as tuned
 from edge_server.export.camera_paths import Step, lens, looking, orbit, read_nerfstudio, vertical_fov_deg
-from edge_server.export.images import IMAGE_ENDINGS, Image, checked_file, write_video
+from edge_server.export.images_and_video import IMAGE_ENDINGS, Image, checked_file, write_video
 from edge_server.export.run_source import Source, open_source
 from edge_server.export.viewed_field import checked_size
 from edge_server.fidelity.images import to_bytes

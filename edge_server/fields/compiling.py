@@ -14,7 +14,7 @@ from contextlib import contextmanager
 
 from numba.core import event
 
-from edge_server.fields.common.field_constants import COMPILING_EVERY_S
+from edge_server.fields.field_constants import COMPILING_EVERY_S
 
 log = logging.getLogger(__name__)
 

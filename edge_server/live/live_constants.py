@@ -62,6 +62,7 @@ MOST_PENDING = 8  # publications that wait for their truth: more means that no h
 GAP_PERIODS = 0.55
 
 # --- scores: what they may cost (scoring.scoring_thread) ---
+FIELD_NICE = 5  # of the field's workers, in a server that answers cameras meanwhile
 SCORING_NICE = 5  # niceness: scoring serves observers and gives way to the field's updates
 WAITING_FRAMES = 256  # held-out frames that wait while one publication is scored; older ones are not needed
 WAITING_PUBLICATIONS = 2  # publications that wait while another one is scored; the oldest of more is left out

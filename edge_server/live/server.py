@@ -23,7 +23,6 @@ import msgspec
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
-from edge_server.fields.common.field_constants import SERVER_NICE
 from edge_server.fields.registry import make_field
 from edge_server.live import live_constants as tuned
 from edge_server.live.best_update_time import open_frontier
@@ -315,7 +314,7 @@ class EdgeServer:
         controls.policy, controls.value, controls.chosen = policy.name, policy.value, policy
 
     def _make_field(self, config: EdgeConfig) -> Field:
-        return make_field(config.field, {"nice": SERVER_NICE, **config.field_options}, seed=self.scenario.seed)
+        return make_field(config.field, {"nice": tuned.FIELD_NICE, **config.field_options}, seed=self.scenario.seed)
 
     def _camera_moves(self, config: EdgeConfig, camera: str) -> None:
         """Follow the updater, which has begun anew because ``camera`` moves."""

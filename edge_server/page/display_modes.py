@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.edge_constants import ERROR_GAIN
 from edge_server.fields import Rendering
 from edge_server.live.state import CameraView, Comparison
 from edge_server.page.colors import UNKNOWN, age_colors
 from edge_server.page.page_constants import AGE_VIEW_LIGHT, AGE_VIEW_STEP, DEPTH_PERCENTILES, LABEL_PX, SOLID
-from edge_server.report.report_constants import ERROR_GAIN
 from freshfield.geometry import Pinhole, seen_from, world_rays
 
 PICTURE, DEPTH, AGE, TRUTH, ERROR = "picture", "depth", "age", "truth | picture", "error"

@@ -52,6 +52,10 @@ AGE_VIEW_LIGHT = 0.35
 LABEL_PX = 10  # from the left edge of an image to the words on it; they stand twice as far below its top
 
 # --- rendering for visitors (rendering, foxglove_live) ---
+# Of images while the visitor moves, at rest, and at rest with nothing new to show: seconds for one, largest share of
+# all time, least and most rows. An image of fewer rows is not worth its fixed cost, the wait for a training step of the
+# field to end.
+DETAIL = ((0.08, 0.5, 64, 240), (0.2, 0.2, 120, 480), (1.2, 0.15, 200, 720))
 RENDER_LEAST_S = 0.03  # shortest budget for the image of a new publication: at a share of .2, seven pictures a second
 RENDER_BAND_S = 0.1  # of a band of rows: an image may be abandoned between two bands
 RENDER_MIN_GAP_S = 0.05  # least time from one image of a level to the next: it spares network and browser

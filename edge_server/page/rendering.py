@@ -48,14 +48,8 @@ class DetailLevel:
     max_rows: int
 
 
-# While the visitor moves, at rest, and at rest with nothing new to show. An image below min_rows is not worth its fixed
-# cost, the wait for a training step of the field to end.
 MOVING, NEWER = 0, 1
-LEVELS = (
-    DetailLevel(budget_s=0.08, max_share=0.5, min_rows=64, max_rows=240),
-    DetailLevel(budget_s=0.20, max_share=0.2, min_rows=120, max_rows=480),
-    DetailLevel(budget_s=1.2, max_share=0.15, min_rows=200, max_rows=720),
-)
+LEVELS = tuple(DetailLevel(*each) for each in tuned.DETAIL)
 
 
 BrowserView = tuple[NDArray[np.float64], NDArray[np.float64], float, int, int]

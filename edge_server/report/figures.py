@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 
+from edge_server.edge_constants import ERROR_GAIN
 from edge_server.fidelity.scorer import SELECTED, fidelity_title
 from edge_server.matplotlib_figures import BLUE, GRAY, GREEN, INK, ORANGE, PURPLE, SKY, VERMILION, figure, label_lines
 from edge_server.report import report_constants as tuned
@@ -178,13 +179,13 @@ def draw_comparison(report: Report, files: RunFiles, path: Path) -> bool:
     truth, rendered = _image(files, "truth"), _image(files, "rendered")
     if truth is None or rendered is None or truth.shape != rendered.shape:
         return False
-    error = np.clip(np.abs(truth - rendered) * tuned.ERROR_GAIN, 0.0, 1.0)
+    error = np.clip(np.abs(truth - rendered) * ERROR_GAIN, 0.0, 1.0)
     height = 2.75 * truth.shape[0] / truth.shape[1] + 0.35
     with figure(path, 1, 3, height_inch=height) as (_, axes):
         truth_is = "held-out truth" if report["kind"] == "fit" else "truth at the present"
         if SELECTED in report["fidelity"]["scored_on"]:
             truth_is = "a training view"
-        titles = (truth_is, "the field's rendering", f"error, {tuned.ERROR_GAIN:g} times")
+        titles = (truth_is, "the field's rendering", f"error, {ERROR_GAIN:g} times")
         for ax, image, title in zip(axes[0], (truth, rendered, error), titles):
             ax.imshow(image, interpolation="nearest")
             ax.set_title(title)

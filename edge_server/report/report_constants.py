@@ -25,7 +25,5 @@ CUT_OFF_NS = 10 * 10**9
 MOST_CONTRADICTIONS = 20  # that are listed, enough to see what went wrong; the count says how often
 
 # --- figures (figures, explain_command) ---
-# Factor by which errors are brightened, also on the page: one of 10 % of the range is plain to see.
-ERROR_GAIN = 4.0
 MOST_LABELS = 24  # most cameras that have a label of their own
 MOST_BARS = 20  # most cameras that have a bar of their own where a decision is explained

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.supervision import lens_row
 from edge_server.fields.common.threads.thread_pool import Pool, shared_pool
-from edge_server.fields.splat.carried_camera.discs import filled
+from edge_server.fields.splat.carried_camera.seeds_on_depth import filled
 from edge_server.surface import surface_constants as tuned
 from edge_server.surface.depth import DepthMap
 from edge_server.surface.kernels.patch_images import Images, Planes, Search, View

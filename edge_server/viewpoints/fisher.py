@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.field_constants import BETA1
+from edge_server.fields.field_constants import BETA1
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, age_corrections
 from edge_server.fields.splat.kernels.rasterize import Targets

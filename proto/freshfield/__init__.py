@@ -11,20 +11,20 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from channel_emu.virtual.simulate import VirtualChannel as Channel
+    from channel_emu.virtual.virtual_channel import VirtualChannel as Channel
     from edge_server.experiments.fitting.fit import Fit as Fit
     from edge_server.experiments.fitting.fit import fit as fit
     from edge_server.experiments.fitting.fit import load as load
     from edge_server.experiments.virtual.try_policy import Trial as Trial
     from edge_server.experiments.virtual.try_policy import try_policy as try_policy
-    from edge_server.export.images import write_video as write_video
+    from edge_server.export.images_and_video import write_video as write_video
     from edge_server.scheduler import Policy as Policy
     from freshfield_up.deployment import Deployment as deployment
 
 __version__ = "0.1.0"
 
 _LIBRARY = {
-    "Channel": "channel_emu.virtual.simulate:VirtualChannel",
+    "Channel": "channel_emu.virtual.virtual_channel:VirtualChannel",
     "Fit": "edge_server.experiments.fitting.fit:Fit",
     "Policy": "edge_server.scheduler:Policy",
     "Trial": "edge_server.experiments.virtual.try_policy:Trial",
@@ -32,7 +32,7 @@ _LIBRARY = {
     "fit": "edge_server.experiments.fitting.fit:fit",
     "load": "edge_server.experiments.fitting.fit:load",
     "try_policy": "edge_server.experiments.virtual.try_policy:try_policy",
-    "write_video": "edge_server.export.images:write_video",
+    "write_video": "edge_server.export.images_and_video:write_video",
 }
 """Public name -> module and name there."""
 

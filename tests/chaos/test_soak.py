@@ -15,8 +15,8 @@ from freshfield import ledger
 from freshfield import scenario as scenarios
 from freshfield.files import read_status
 from freshfield_up.child_process import Child, kill, stop
-from freshfield_up.commands import Options, process_set
 from freshfield_up.ports import free_ports, is_serving
+from freshfield_up.process_set import Options, process_set
 from tests.deploy.test_up import SMALL
 from tests.support import wait_until
 

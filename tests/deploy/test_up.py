@@ -23,13 +23,13 @@ from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 import freshfield as ff
 from freshfield.files import read_status
 from freshfield.scenario import ScenarioError, load
-from freshfield_up import child_process, commands, launcher
+from freshfield_up import child_process, launcher, process_set
 from freshfield_up import healthy as health_check
 from freshfield_up.child_process import Child
 from freshfield_up.cli import main, seconds
-from freshfield_up.commands import ProcessSet
 from freshfield_up.deployment import DeploymentError
 from freshfield_up.folder import EARLIER, KEY, MARKER, FolderError, forget_earlier, prepare
+from freshfield_up.process_set import ProcessSet
 from freshfield_up.status import status_line, summarize
 from tests.camera_node.robot.arm.simulated import own_address, require_ur_rtde
 from tests.conftest import ROOT
@@ -59,7 +59,7 @@ def asleep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., lau
         processes = ProcessSet(*made, "127.0.0.1:1", "")
         monkeypatch.setattr(launcher, "process_set", lambda *_: processes)
         (tmp_path / "small.yaml").write_text(SMALL)
-        run = launcher.Launcher(load(tmp_path / "small.yaml"), commands.Options(tmp_path / "run", port=free_port()))
+        run = launcher.Launcher(load(tmp_path / "small.yaml"), process_set.Options(tmp_path / "run", port=free_port()))
         run.processes = processes
         return run
 
@@ -173,8 +173,8 @@ CELL = load("cell")
 
 
 def test_a_simulated_arm_and_its_driver_belong_to_the_run(monkeypatch, tmp_path):
-    monkeypatch.setattr(commands, "program", lambda name: name)
-    found = commands.process_set(CELL, commands.Options(tmp_path))
+    monkeypatch.setattr(process_set, "program", lambda name: name)
+    found = process_set.process_set(CELL, process_set.Options(tmp_path))
     assert [child.command[1] for child in found.arms + found.drivers] == ["simulate-arm", "drive-arm"]
     assert found.arm_address == "127.0.0.2:30004"
     # Senders stop before receivers: driver, cameras, arm, channel, edge.

@@ -8,9 +8,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from edge_server.edge_constants import MOST_CARRIED
+from edge_server.edge_constants import CARRIED_OPTIONS, MOST_CARRIED
 from edge_server.embed.settings import EmbeddingConfig
-from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.machine import machine
 from edge_server.progress import ProgressLine
 from edge_server.settings import EdgeConfig, KeyframesConfig, cameras_move, read_config
@@ -19,7 +18,7 @@ from freshfield.settings import Settings
 from tests.support import refused
 
 STILL = EdgeConfig("splat", {"layers": True}, updates="arrivals", update_ms=20.0, steps=10)
-MOVING = EdgeConfig("splat", LIVE_OPTIONS, updates="cycle", update_ms=80.0, steps=8)
+MOVING = EdgeConfig("splat", CARRIED_OPTIONS, updates="cycle", update_ms=80.0, steps=8)
 MANY_MOVING = EdgeConfig("splat", updates="cycle", update_ms=800.0, steps=100, keyframes=KeyframesConfig(32, 0.03, 5.0))
 
 
@@ -78,7 +77,8 @@ def test_what_a_scenario_says_wins(edge, still, moving):
         layers = bool(found.field_options.get("layers"))
         assert (layers, found.updates, found.update_ms, found.steps, found.keyframes is not None) == expected
     for given in ({"gaussians": 900}, {"layers": False}):
-        assert read_config(scenario({"field_options": given}), moving=True).field_options == {**LIVE_OPTIONS, **given}
+        found = read_config(scenario({"field_options": given}), moving=True)
+        assert found.field_options == {**CARRIED_OPTIONS, **given}
 
 
 def test_files_that_a_section_names_lie_beside_the_scenario():

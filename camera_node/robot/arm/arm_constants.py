@@ -32,8 +32,3 @@ LEAST_VIEWPOINTS = 3  # that a tour has to reach
 TOOL_M, TOOL_RADIUS_M = 0.08, 0.04  # length and radius of the camera and its mount, as in TeleopConfig
 MARGIN_M = 0.01  # least gap between parts of the arm, whose capsules are rounded up
 SINGULAR_DEG, SINGULAR_M = 5.0, 0.02  # nearness: of elbow and wrist; of the wrist's center to the base's axis
-
-# --- checks of camera-node doctor (checks) ---
-LISTEN_S = 0.5  # for which joint states are counted
-LEAST_STATES = 0.8  # share of the joint states asked for; with fewer, the network or the machine is busy
-LEAST_REACHED = 0.6  # share of a tour's viewpoints; with fewer, a side of the target stays unseen

@@ -16,8 +16,8 @@ from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration.calibration_constants import EXPLAINED
 from camera_node.robot.calibration.hand_eye.samples import Array, Samples
 from camera_node.robot.calibration.targets import WHICH_PRINT, Corners, Target, estimate_pose
+from camera_node.sources.calibration_file import load_calibration
 from camera_node.sources.datasets.image_reading import decode_file
-from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, se3, so3_exp
 from freshfield.untrusted import read_text, read_yaml
 

@@ -13,7 +13,7 @@ from camera_node.robot.calibration import CalibrationError
 from camera_node.robot.calibration import calibration_constants as tuned
 from camera_node.robot.calibration.hand_eye.samples import Array
 from camera_node.robot.calibration.targets import Corners
-from camera_node.sources.rig_calibration import calibration_entry
+from camera_node.sources.calibration_file import calibration_entry
 from freshfield.geometry import Pinhole
 
 _UNDETERMINED = "the pictures do not determine a lens: show the target larger, tilted, everywhere"

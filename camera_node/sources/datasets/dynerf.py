@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node.sources.calibration_file import CalibratedCamera
 from camera_node.sources.datasets.image_reading import read_numbers
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import Dataset, DatasetError, errors_at, file_within
 from camera_node.sources.datasets.video import Clip, rig_dataset
-from camera_node.sources.rig_calibration import CalibratedCamera
 from camera_node.sources.source_constants import SAME_SHAPE
 from freshfield.geometry import Pinhole, Pose
 

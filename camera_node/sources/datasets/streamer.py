@@ -8,8 +8,7 @@ camera steps through its photos back and forth, like a moving camera.
 from __future__ import annotations
 
 import logging
-from bisect import bisect_left
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -19,11 +18,11 @@ from numpy.typing import NDArray
 
 from camera_node.pose.providers import PoseProvider
 from camera_node.pose.trajectories import trajectory_poses
-from camera_node.settings import FPS_RANGE, RecordedConfig, VideoConfig, find_data
+from camera_node.settings import FPS_RANGE, PHOTO_FPS, RecordedConfig, VideoConfig, find_data
 from camera_node.sources.base import Shot, Source, assign_cameras, rate
 from camera_node.sources.datasets.formats import open_configured
 from camera_node.sources.datasets.records import Dataset, DatasetError, PosedImage
-from camera_node.sources.source_constants import HOLD_OUT_EVERY, PHOTO_FPS
+from camera_node.sources.held_out_captures import split_photos, without_held_out_images
 from freshfield import payload
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
@@ -116,7 +115,7 @@ def open_recorded(
         playback = Playback(len(shots), ticks_per_s, timeline.fps if timeline.count else ticks_per_s)
         if scenario.held_out_every:
             every = scenario.held_out_every
-            shots = _apart([shots[n] for n in playback.whole_groups(every)], every)
+            shots = without_held_out_images([shots[n] for n in playback.whole_groups(every)], every)
             playback = Playback(len(shots), playback.fps, playback.fps)
         sources[camera] = ImageSource(camera, shown[camera], shots, playback, config.codec, poses.get(camera))
     return sources
@@ -127,38 +126,6 @@ def _shown(dataset: Dataset, name: str, held_out: bool) -> tuple[PosedImage, ...
     it has no others."""
     images = dataset.of(name)
     return tuple(image for image in images if held_out or image.name not in dataset.held_out) or images
-
-
-def _apart(shown: Sequence[int], every: int) -> list[int]:
-    """The images of captures, of which the first of ``every`` is held out, so that no other one shows its image: a rate
-    above the recording's repeats images, and so does a dropped frame. Those show the one before or after it. Raises
-    DatasetError where none is left for them."""
-    held = set(shown[::every])
-    own = sorted(set(shown) - held)
-    apart = list(shown)
-    for n, image in enumerate(shown):
-        if n % every and image in held:
-            if not own:
-                raise DatasetError(f"one of {every} captures is held out: no other has an image of its own: lower fps")
-            after = bisect_left(own, image)
-            apart[n] = own[min(after, len(own) - 1) if n % every <= every // 2 else max(0, after - 1)]
-    return apart
-
-
-def split_photos(
-    count: int, training: Sequence[str], held_out: Sequence[str], own: Collection[int] = ()
-) -> dict[str, list[int]]:
-    """Image indices of each camera. The data set's ``own`` test images, else those with index % 8 == 0, go to the
-    held-out cameras in turn (if there are any), the others to the training cameras in turn. Raises DatasetError if a
-    camera would get none."""
-    truth = sorted(own) or ([i for i in range(count) if i % HOLD_OUT_EVERY == 0] if held_out else [])
-    rest = [i for i in range(count) if i not in set(truth)]
-    shares = {camera: truth[k :: len(held_out)] for k, camera in enumerate(held_out)}
-    shares |= {camera: rest[k :: len(training)] for k, camera in enumerate(training)}
-    empty = [camera for camera, share in shares.items() if not share]
-    if empty:
-        raise DatasetError(f"{count} images are too few: none is left for {', '.join(empty)}; use fewer cameras")
-    return shares
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from camera_node.sources import source_constants as tuned
 from camera_node.sources.base import rate
+from camera_node.sources.calibration_file import CalibratedCamera, load_calibration
 from camera_node.sources.datasets.image_reading import as_image, resize, shrink
 from camera_node.sources.datasets.photo import FULL_SIZE, ImageOptions
 from camera_node.sources.datasets.records import (
@@ -22,7 +23,6 @@ from camera_node.sources.datasets.records import (
     file_within,
     find_files,
 )
-from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.geometry import Pinhole
 

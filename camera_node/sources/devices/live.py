@@ -17,11 +17,11 @@ from fractions import Fraction
 from functools import partial
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
-from camera_node.settings import LiveConfig, beside
+from camera_node.settings import FIRST_FRAME_S, LIVE_FPS, LiveConfig, beside
 from camera_node.sources import source_constants as tuned
 from camera_node.sources.base import Shot, Source, rate
+from camera_node.sources.calibration_file import CalibratedCamera, load_calibration
 from camera_node.sources.devices.feed import CameraError, Feed, Image, as_camera_error
-from camera_node.sources.rig_calibration import CalibratedCamera, load_calibration
 from freshfield.clock import Clock, WallClock
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
@@ -69,7 +69,7 @@ class LiveSource(Source):
         opener: Callable[[], Feed],
         poses: PoseProvider,
         calibrated: Pinhole | float | None = None,
-        first_frame_s: float = tuned.FIRST_FRAME_S,
+        first_frame_s: float = FIRST_FRAME_S,
     ) -> None:
         self.camera, self.fps = camera, fps
         self._open, self._poses = opener, poses
@@ -188,7 +188,7 @@ def open_live(
     devices = [str(config.devices[camera]) for camera in cameras if camera in config.devices]
     if doubles := [device for device in devices if devices.count(device) > 1]:
         raise ScenarioError(f"{scenario.path}: source.devices: more than one camera is {doubles[0]}")
-    fps, clock = rate(config.fps or tuned.LIVE_FPS), WallClock()
+    fps, clock = rate(config.fps or LIVE_FPS), WallClock()
     known = calibrations(scenario, config) if any_fov_deg is None else {}
     standing = FixedPose(Pose((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
     poses = _poses(scenario, config, cameras, known) if any_fov_deg is None else dict.fromkeys(cameras, standing)

@@ -19,8 +19,8 @@ import cv2
 
 from edge_server.experiments.engine.content_key import plain, result_key, surroundings
 from edge_server.experiments.engine.engine_constants import BATCH, PARENT_EVERY_S, RETRIES
-from edge_server.fields.common.field_constants import MOST_WORKERS
 from edge_server.fields.common.threads.thread_pool import THREADS_VARIABLE
+from edge_server.fields.field_constants import MOST_WORKERS
 from edge_server.progress import ProgressLine
 from freshfield.files import Lines
 from freshfield.machine_load import usable_cores

@@ -183,7 +183,7 @@ class Fit(ViewedField):
             return []
         found = []
         if isinstance(self.field, RefinesCameras):
-            from edge_server.fields.common.cameras.constant_correction import constant_correction
+            from edge_server.fields.common.cameras.mount_error import constant_correction
 
             refined = [(v, c) for v in self.data.training if (c := self.field.correction(v)) is not None]
             common = constant_correction(

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from camera_node.settings import WORLD_FPS
 from camera_node.synthetic import SCENES, make_scene
 from camera_node.synthetic.scene import HELD_OUT, Scene
-from camera_node.synthetic.synthetic_constants import WORLD_FPS
 from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import OptionError
 from edge_server.experiments.scenes.captures import SUFFIXES, load_captures

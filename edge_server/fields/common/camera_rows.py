@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.kernels.camera import CAMERA, LENS, LIMITS, NEAR, ORIGIN, SIZE
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import lens_row

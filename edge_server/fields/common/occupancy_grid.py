@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.mlp import Net
 from edge_server.fields.common.kernels.occupancy import CELLS_A_TASK, Cells, sample_density, threshold

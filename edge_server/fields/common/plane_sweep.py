@@ -10,29 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
+from edge_server.fields.common.background import empty_color, foreground_mask
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.kernels.plane_sweep import NOT_SEEN, SEES, UNMARKED, score_cells, sweep_rays
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.scene_box import SceneBox, plain_background
+from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.settings import FieldSettings
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
 from edge_server.fields.common.threads.thread_pool import Pool
-
-
-def empty_color(settings: FieldSettings, views: Sequence[View]) -> NDArray[np.float32] | None:
-    """The pictures' plain background color (3,), if they have one and the field renders it where nothing is.
-    With another background, which the user chose, a plain sky has to be learned like everything else."""
-    return plain_background(views) if settings.background == "auto" and views else None
-
-
-def foreground_mask(image: NDArray[np.uint8], plain: NDArray[np.float32] | None) -> NDArray[np.bool_]:
-    """Which pixels, bool (H, W), are neither transparent nor of the plain background color (3,)."""
-    if image.shape[2] == 4:
-        return np.asarray(image[..., 3] >= tuned.EMPTY_ALPHA)
-    if plain is None:
-        return np.ones(image.shape[:2], bool)
-    return np.asarray(np.abs(image / 255.0 - plain).sum(axis=2) >= tuned.EMPTY_COLOR)
 
 
 def score_grid(

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
+from edge_server.fields.common.background import plain_background
 from freshfield.geometry import converging_point
 
 Array = NDArray[np.float64]
@@ -160,20 +161,6 @@ def _main_group(origins: Array) -> Array:
     apart = np.linalg.norm(origins - np.median(origins, axis=0), axis=1)
     kept = apart <= tuned.FAR_AWAY * max(float(np.median(apart)), 1e-3)
     return origins[kept] if 4 * np.count_nonzero(~kept) <= len(origins) else origins
-
-
-def plain_background(views: Sequence[View]) -> NDArray[np.float32] | None:
-    """The color (3,) in [0, 1] that nearly all pictures have nearly everywhere along their edges, if any."""
-    edges = []
-    for view in views:
-        if view.image.shape[2] == 4:
-            return None
-        image = view.image
-        edges.append(np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]]).astype(np.int16))
-    color = np.median(np.concatenate(edges), axis=0)
-    plain = [(np.abs(edge - color).max(axis=-1) <= tuned.PLAIN_STEPS).mean() for edge in edges]
-    enough = np.percentile(plain, tuned.PLAIN_PERCENTILE) >= tuned.PLAIN_EDGE
-    return (color / 255.0).astype(np.float32) if enough else None
 
 
 def _seen_radius(views: Sequence[View], center: Array) -> float:

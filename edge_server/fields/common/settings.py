@@ -11,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, TypeVar
 import msgspec
 from msgspec import Meta
 
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from freshfield.settings import ScenarioError, Settings, about, read_settings, within
 
 BATCH = 2048  # ``kernels.train.CHUNK``, samples; settings do not load kernels

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, FitReport, Rendering, Snapshot, View
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.field_state import all_or_nothing, pack_state, unpack_meta
 from edge_server.fields.common.threads.fair_lock import FairLock
 from edge_server.fields.common.threads.thread_pool import Pool, compile_kernels, shared_pool

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.kernels.rays import Views
 from edge_server.fields.common.scene_box import SceneBox
 from freshfield.geometry import GeometryError, Pinhole, Pose, invertible

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.cameras.camera_refinement import CameraRefinement
 from edge_server.fields.common.field_state import load_arrays
 from edge_server.fields.common.kernels.adam import PART, Rule, adam

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from edge_server.fields import Budget
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.settings import TrainerSettings
 
 

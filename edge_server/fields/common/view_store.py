@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
+from edge_server.fields.common.background import find_background
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.scene_box import SceneBox, plain_background, scene_box
+from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.settings import FieldSettings
 from edge_server.fields.common.supervision import CameraMemory, check_view, pack_views, remember_views
 from freshfield.geometry import Pinhole
@@ -66,7 +67,7 @@ class ViewStore:
             if self.box is None or not _similar(box, self.box):
                 self.box, box_changed = box, True
             self._box_cameras = len(self.memory)
-            self.auto_background, self.background_is_plain = _find_background(views)
+            self.auto_background, self.background_is_plain = find_background(views)
         if has_new_images and any(m.moved is not None for m in self.memory.values()):
             visibility_changed = True
         data = pack_views(views, self.box, self.memory)
@@ -139,20 +140,6 @@ class ViewStore:
 def same_views(a: Sequence[View], b: Sequence[View]) -> bool:
     """Whether both hold the very same objects."""
     return len(a) == len(b) and all(x is y for x, y in zip(a, b))
-
-
-def _find_background(views: Sequence[View]) -> tuple[NDArray[np.float32], bool]:
-    """The color (3,) taken to be behind everything, and whether it is a plain background's.
-
-    White for cut-out pictures, else the plain color along the pictures' edges, else the mean color, which is
-    the smallest mistake where rays find nothing.
-    """
-    if any(v.image.shape[2] == 4 for v in views):
-        return np.ones(3, np.float32), False
-    plain = plain_background(views)
-    if plain is not None:
-        return plain, True
-    return np.mean([v.image.mean(axis=(0, 1)) / 255.0 for v in views], axis=0).astype(np.float32), False
 
 
 def _check_box(box: SceneBox) -> None:

@@ -10,9 +10,9 @@ from typing import Any, ClassVar
 import msgspec
 import numpy as np
 
-from edge_server.fields.common.field_constants import NGP_FINEST, NGP_FINEST_AT_FIRST, NGP_FIRST_TABLE
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT, Grid, scatter
 from edge_server.fields.common.trained_field import DIRTY, TINY, TrainedField
+from edge_server.fields.field_constants import NGP_FINEST, NGP_FINEST_AT_FIRST, NGP_FIRST_TABLE
 from edge_server.fields.ngp.settings import NgpSettings
 
 assert SEGMENT * FEATURES == DIRTY, "scatter and adam must use the same segments"

@@ -9,9 +9,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from edge_server.fields import View
+from edge_server.fields.common.background import empty_color, foreground_mask
 from edge_server.fields.common.kernels.plane_sweep import NOT_SEEN
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.plane_sweep import empty_color, foreground_mask, score_grid, sweep_depths
+from edge_server.fields.common.plane_sweep import score_grid, sweep_depths
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.supervision import pack_cameras, supervising_views
 from edge_server.fields.common.threads.thread_pool import Pool

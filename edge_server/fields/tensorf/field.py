@@ -9,9 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import FIRST_DENSITY, TENSORF_FINEST
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.trained_field import DIRTY, TrainedField
+from edge_server.fields.field_constants import FIRST_DENSITY, TENSORF_FINEST
 from edge_server.fields.tensorf.kernels.vector_matrix import CHANNELS, MODES, ROWS, Planes, scatter_planes
 from edge_server.fields.tensorf.settings import TensorfSettings
 

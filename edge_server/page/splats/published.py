@@ -13,7 +13,7 @@ from edge_server.fields.splat.layers import layer_constants as layers
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
 from edge_server.fields.splat.snapshot import SplatSnapshot
-from edge_server.page.splats import browser_splat_constants as tuned
+from edge_server.page.splats import splat_stream_constants as tuned
 from edge_server.page.splats.messages import MOST_ANCHORS, KnotsBlock, MovingBlock, SceneBlock
 from edge_server.page.splats.records import scale_range, to_records, weights
 

@@ -24,7 +24,7 @@ from websockets.http11 import Response
 from edge_server.live.state import CameraView, EdgeState
 from edge_server.page.colors import HELD_OUT, age_color
 from edge_server.page.page_thread import PageThread
-from edge_server.page.splats.browser_splat_constants import IDLE_S, TICK_S
+from edge_server.page.splats.splat_stream_constants import IDLE_S, TICK_S
 from edge_server.page.viewpoint import VERTICAL_FOV_RAD, Viewpoint
 
 if TYPE_CHECKING:  # with the kernels of Gaussians, which another field does not need

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.page.splats import browser_splat_constants as tuned
+from edge_server.page.splats import splat_stream_constants as tuned
 from edge_server.page.splats.messages import (
     MovingBlock,
     StaticBlock,

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from camera_node.pose import tracker
 from camera_node.pose.pairing import PoseGapError, SampleBuffer, interpolate_joints
-from camera_node.pose.providers import read_tum
 from camera_node.pose.tracker import TrackerPoses
+from camera_node.pose.trajectory_file import read_tum
 from freshfield.geometry import Pose, se3, so3_exp
 from tests.camera_node.sources.datasets.photos import fails
 from tests.support import patiently, refused

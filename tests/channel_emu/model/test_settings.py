@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from channel_emu.estimate.recording import read_recording
-from channel_emu.model.notation import NotationError, delays_ms
 from channel_emu.model.settings import channel_from_mapping
+from channel_emu.model.table import TableError, read_delays
 from tests.support import refused
 
 
@@ -89,7 +89,7 @@ def test_delays_are_read_by_the_header(tmp_path):
         "delay_ms,lost\n20,no\nNaN,yes\n21.5,no\n,no\n30,no\n",
     ):
         (tmp_path / "delays").write_text(text)
-        assert delays_ms(tmp_path / "delays") == pytest.approx([20.0, 21.5, 30.0])
+        assert read_delays(tmp_path / "delays") == pytest.approx([20.0, 21.5, 30.0])
 
 
 def test_what_can_be_read_in_two_ways_or_none_is_refused(tmp_path):
@@ -106,7 +106,7 @@ def test_what_can_be_read_in_two_ways_or_none_is_refused(tmp_path):
         ("", "holds no delay"),
     ):
         (tmp_path / "delays").write_text(text)
-        refused(NotationError, message, delays_ms, tmp_path / "delays")
+        refused(TableError, message, read_delays, tmp_path / "delays")
 
 
 def test_recordings_are_read_by_the_header(tmp_path):

@@ -12,7 +12,7 @@ from edge_server.experiments.scenes.recorded import load_recorded
 from edge_server.export import file_names, ply
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.exporter import write_mesh
-from edge_server.export.images import write_images
+from edge_server.export.images_and_video import write_images
 from edge_server.export.point_cloud import sparse_points
 from edge_server.export.splats import Y0, splat_table, write_splats
 from edge_server.export.transforms import write_transforms

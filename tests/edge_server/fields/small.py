@@ -14,8 +14,8 @@ import pytest
 from msgspec import structs
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.field_constants import PARAMETER_LIMIT
 from edge_server.fields.common.threads.thread_pool import CallerPool
+from edge_server.fields.field_constants import PARAMETER_LIMIT
 from edge_server.fields.nerfacto.field import NerfactoField
 from edge_server.fields.nerfacto.settings import NerfactoSettings
 from edge_server.fields.ngp.field import NgpField

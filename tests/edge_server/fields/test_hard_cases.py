@@ -17,7 +17,7 @@ import pytest
 
 from edge_server.fields import Budget, View
 from edge_server.fields.common.cameras import camera_refinement_constants as refinement
-from edge_server.fields.common.field_constants import PARAMETER_LIMIT
+from edge_server.fields.field_constants import PARAMETER_LIMIT
 from edge_server.fields.splat.kernels.project import OPACITY
 from freshfield.geometry import Pinhole, look_at
 from tests.conftest import ROOT

@@ -10,9 +10,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from edge_server.fields.common.field_constants import OPAQUE_DEPTH
 from edge_server.fields.common.kernels.hash_grid import FEATURES
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
+from edge_server.fields.field_constants import OPAQUE_DEPTH
 
 
 def to_torch(grid: Any) -> Any:

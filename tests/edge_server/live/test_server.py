@@ -22,9 +22,9 @@ import numpy as np
 import pytest
 
 from edge_server.cli import main as edge_server
+from edge_server.edge_constants import CARRIED_OPTIONS
 from edge_server.fields import checkpoint
 from edge_server.fields.registry import make_field
-from edge_server.fields.splat.carried_camera.carried_camera_constants import LIVE_OPTIONS
 from edge_server.fields.splat.carried_camera.carried_field import CarriedField
 from edge_server.live.live_constants import AGES_PERIOD_S, MAX_SCRAPES, MAX_SNAPSHOTS, MAX_WATCHERS, STOP_S
 from edge_server.live.loop import UpdateLoop
@@ -205,7 +205,7 @@ def test_operators_see_and_change_a_running_server(serve):
 
 def test_a_camera_that_moves_begins_the_field_anew_as_a_scan_and_a_resumed_run_knows_it(serve, tmp_path):
     small = {"gaussians": 300, "start": 200, "seed_cells": 12}
-    for kind in ({"layers": True}, LIVE_OPTIONS):  # compiling may take longer than the test waits for anything
+    for kind in ({"layers": True}, CARRIED_OPTIONS):  # compiling may take longer than the test waits for anything
         make_field("splat", {**kind, **small}).warm_up()
     known = json.loads(resources.files("edge_server").joinpath("frontier.json").read_text())["updates"]
     own = {"updates": [row for row in known if row["options"].get("layers")]}  # knows the first choice only

@@ -21,7 +21,7 @@ from camera_node.robot.calibration.calibration_constants import (
 from camera_node.robot.calibration.hand_eye.samples import medoid
 from camera_node.robot.calibration.rig.bundle_adjustment import Bundle, Sighting, adjust
 from camera_node.robot.calibration.targets import Array, Corners, estimate_pose
-from camera_node.sources.rig_calibration import calibration_entry
+from camera_node.sources.calibration_file import calibration_entry
 from freshfield.geometry import Pinhole, se3_inverse
 
 # From a target's axes (y down, z away from the viewer) to the world's (z up where the target lies on the floor).

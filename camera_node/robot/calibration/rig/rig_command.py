@@ -68,9 +68,9 @@ def scaled_model(folder: Path, first: str, second: str, meters: str) -> tuple[st
     An image belongs to the camera that its folder, else its file, is named after; the first one of a camera counts.
     Raises CalibrationError, and DatasetError where the model cannot be read.
     """
+    from camera_node.sources.calibration_file import calibration_entry
     from camera_node.sources.datasets.colmap import load_dataset
     from camera_node.sources.datasets.records import PosedImage
-    from camera_node.sources.rig_calibration import calibration_entry
 
     try:
         length = float(meters)
@@ -114,7 +114,7 @@ def _from_target(args: argparse.Namespace) -> Any:
     from camera_node.robot.calibration.rig import rig_inputs
     from camera_node.robot.calibration.rig.rig_calibration import calibrate_rig
     from camera_node.robot.calibration.targets import parse_target
-    from camera_node.sources.rig_calibration import load_calibration
+    from camera_node.sources.calibration_file import load_calibration
 
     board = parse_target(args.board)
     if args.live is not None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.cameras import camera_refinement_constants as tuned
-from edge_server.fields.common.field_constants import BETA1, BETA2
+from edge_server.fields.field_constants import BETA1, BETA2
 
 Array = NDArray[np.float64]
 

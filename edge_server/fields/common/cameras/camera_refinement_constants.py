@@ -19,7 +19,7 @@ DAMPING, USUAL = 1e-3, np.array([0.03] * 3 + [0.02] * 3)
 # for REACH views: errors of tracking vary slowly, and a fit of some seconds looks at each view but a few times.
 SPREAD, REACH = 0.8, 8
 
-# --- what all corrections of a camera have in common (constant_correction) ---
+# --- what all corrections of a camera have in common (mount_error) ---
 PARTS = 8  # parts of the path, each left out in turn (jackknife)
 LEAST_POSES = 2 * PARTS  # fewest poses from which anything in common is told
 # Standard errors, and root mean square errors of single poses, from which on a hint is given: refined in tiny images,

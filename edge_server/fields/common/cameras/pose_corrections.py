@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.cameras import camera_refinement_constants as tuned
-from edge_server.fields.common.field_constants import SAME_POSE
 from edge_server.fields.common.field_state import from_json, to_json
+from edge_server.fields.field_constants import SAME_POSE
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]

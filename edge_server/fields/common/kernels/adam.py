@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_server.fields.common.field_constants import GRADIENT_LIMIT, PARAMETER_LIMIT
 from edge_server.fields.common.kernels.hash_grid import SEGMENT
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add, is_finite
+from edge_server.fields.field_constants import GRADIENT_LIMIT, PARAMETER_LIMIT
 
 PART = 512  # segments a task
 

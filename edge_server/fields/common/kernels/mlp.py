@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import FIRST_DENSITY, FIRST_OUTPUTS
 from edge_server.fields.common.kernels.jit import device_function
+from edge_server.fields.field_constants import FIRST_DENSITY, FIRST_OUTPUTS
 
 BLOCK = 256
 # Columns that rows of activations have beyond those that are used. Rows at a distance of a power of two would all lie

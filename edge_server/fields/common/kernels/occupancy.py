@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.radiance_model import query_density
 from edge_server.fields.common.kernels.rays import COARSE

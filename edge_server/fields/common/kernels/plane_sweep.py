@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common import field_constants as tuned
+from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, distort, load_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.rays import origin_of, pixel_direction

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import HORIZON
 from edge_server.fields.common.kernels.jit import device_function
+from edge_server.fields.field_constants import HORIZON
 
 COARSE = 4  # cells of the occupancy grid a side of one cell of its coarse copy
 NEVER = np.float32(1e30)

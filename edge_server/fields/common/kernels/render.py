@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.field_constants import OPAQUE_DEPTH
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.mlp import PADDING
 from edge_server.fields.common.kernels.radiance_model import implements, query_color, query_density, sample_rays
 from edge_server.fields.common.kernels.rays import NEVER, interval, march, pixel_direction
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, is_finite
 from edge_server.fields.common.kernels.volume_rendering import activate, add_harmonics
+from edge_server.fields.field_constants import OPAQUE_DEPTH
 
 TILE = 256  # rays a task
 ROUND = 8  # samples a ray gets before the opaque ones are dropped

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import ASKED_DEPTH, OPAQUE_DEPTH
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.mlp import PADDING
 from edge_server.fields.common.kernels.radiance_model import (
@@ -27,6 +26,7 @@ from edge_server.fields.common.kernels.volume_rendering import (
     add_harmonics_backward,
     ray_loss,
 )
+from edge_server.fields.field_constants import ASKED_DEPTH, OPAQUE_DEPTH
 
 CHUNK = 2048  # samples a chunk has room for; its activations stay in the second-level cache
 ROW = CHUNK + PADDING  # of which CHUNK are used

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edge_server.fields.common.field_constants import GUIDE_REACH, OPAQUE_DEPTH
 from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.simd import exp32, is_finite
+from edge_server.fields.field_constants import GUIDE_REACH, OPAQUE_DEPTH
 
 # Raw density is clamped before the exponential, forward and backward alike: the largest density makes one
 # step opaque many times over, the smallest makes a whole ray transparent.

@@ -9,9 +9,9 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from edge_server.fields.common.field_constants import WAIT_LOOKS
 from edge_server.fields.common.kernels.jit import kernel
 from edge_server.fields.common.kernels.simd import fetch_add_at
+from edge_server.fields.field_constants import WAIT_LOOKS
 
 _X86 = platform.machine() in ("x86_64", "AMD64")
 

@@ -27,9 +27,9 @@ from typing import Any
 
 import numpy as np
 
-from edge_server.fields.common.field_constants import MOST_WORKERS
 from edge_server.fields.common.kernels.simd import COUNTER
 from edge_server.fields.common.threads.brief_wait import await_next_job, await_workers
+from edge_server.fields.field_constants import MOST_WORKERS
 
 log = logging.getLogger(__name__)
 

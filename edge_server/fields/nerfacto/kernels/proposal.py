@@ -16,18 +16,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import (
-    NERFACTO_CUTOFF_DEPTH,
-    NERFACTO_DARK_SHARE,
-    NERFACTO_RAW_GAIN,
-    NERFACTO_RAW_START,
-)
 from edge_server.fields.common.kernels.jit import device_function
 from edge_server.fields.common.kernels.mlp import PADDING
 from edge_server.fields.common.kernels.radiance_model import implements, sample_rays
 from edge_server.fields.common.kernels.rays import interval, slab, unit_cube
 from edge_server.fields.common.kernels.simd import exp32, is_finite
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
+from edge_server.fields.field_constants import (
+    NERFACTO_CUTOFF_DEPTH,
+    NERFACTO_DARK_SHARE,
+    NERFACTO_RAW_GAIN,
+    NERFACTO_RAW_START,
+)
 
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 

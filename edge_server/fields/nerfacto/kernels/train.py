@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import NERFACTO_RAW_GAIN, NERFACTO_RAW_START, NERFACTO_WEIGHT_FLOOR
 from edge_server.fields.common.kernels.hash_grid import FEATURES, SEGMENT
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.radiance_model import fill_chunk, implements, learn_sampling, query_density
@@ -15,6 +14,7 @@ from edge_server.fields.common.kernels.rays import origin_of
 from edge_server.fields.common.kernels.simd import exp32, fetch_add, uniform
 from edge_server.fields.common.kernels.train import AT, CHUNK, CHUNK_RAYS, LEAVE, draw_ray
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW, activate_density, samples_until_opaque
+from edge_server.fields.field_constants import NERFACTO_RAW_GAIN, NERFACTO_RAW_START, NERFACTO_WEIGHT_FLOOR
 from edge_server.fields.nerfacto.kernels.proposal import bin_scratch, proposal_cells_of, sample_ray
 
 SCATTER_TASKS = 8  # tasks of the kernel that adds up the gradient of the grid

@@ -10,14 +10,12 @@ SETTLE_STEPS = 80  # steps of a Gaussian at full rates, then they fall as 1 / st
 POSITION_PX, COLOR = 0.2, 0.012
 DISSIMILARITY = 0.02  # weight of (1 - SSIM) / 2 in the loss; three times as much raises SSIM and costs PSNR
 
-# --- options of a field, and how many Gaussians (carried_field, scan_field, edge_server.settings) ---
-# Options of a carried camera's field, live, where a scenario says nothing; few pixels bound the Gaussians further.
-LIVE_OPTIONS: dict[str, Any] = {"scan": True, "refine": True, "carried": True, "gaussians": 60_000}
+# --- options of a field, and how many Gaussians (carried_field, scan_field) ---
 PER_PIXEL = 0.78  # Gaussians for each pixel of one image; more cost time in every step, and sharpen little
 LEAST, MOST = 8192, 1 << 18  # Gaussians, whatever the images; the most take 60 MB, and steps of a tenth of a second
 NEAR_SHARE = 0.1  # of the cameras' distance to the scene: a near plane for cameras that are carried close to things
 
-# --- seeds from measured depth (carried_field, discs, scan_field) ---
+# --- seeds from measured depth (carried_field, seeds_on_depth, scan_field) ---
 SEED_VIEWS = 60  # views that seeds come from, at most: the others see hardly anything new
 LEAST_SIDE = 5  # pixels that an image has a side, at least: normals come from differences over so many
 CELLS = (16, 8, 4)  # pixels a side of a quadtree's leaves
@@ -35,7 +33,7 @@ WIDTH, FLATNESS, OPACITY = 0.6, 0.2, 0.8
 STEEPEST = 0.3  # least cosine to the view: nothing is stretched along a surface further than this says
 GUESSED_OPACITY = 0.5  # opacity of seeds at a depth that is guessed
 
-# --- depth by plane sweep, where none is measured (scan_field, sweep) ---
+# --- depth by plane sweep, where none is measured (scan_field, frame_stereo) ---
 # Found on `redkitchen`, against its depth camera.
 SWEPT_VIEWS = 40  # views that are swept, at most
 # No further view is swept once the last SWEPT_LAST views show no seed yet in a mean share of less than SWEPT_NEW of
@@ -61,7 +59,7 @@ AGREES = 0.1  # share by which measured and rendered depth differ where they are
 NEARER = 0.003  # share by which new Gaussians lie before what is rendered
 PRUNE_EVERY = 100  # steps between removals of Gaussians
 
-# --- exposures and poses (exposures, scan_field, tracking) ---
+# --- exposures and poses (exposures, scan_field, pose_alignment) ---
 EXPOSED_FROM = 31  # step from which exposures are estimated: before, the field shows no colors
 TOWARDS_ONE = 0.02  # damping of the least squares towards gain 1 and bias 0, squared colors
 EXPOSURE_SHARE = 0.3  # share of the way to a new estimate that is taken
@@ -72,7 +70,7 @@ GAUGE_EVERY, GAUGE_SHARE = 40, 0.04  # steps between corrections of the gauge; s
 FULL_STEPS = 3
 MOST_DEG, MOST_SHARE = 5.0, 0.1  # largest turn of a pose; largest shift, share of the cameras' distance to the scene
 
-# --- views that come one after the other (carried_field, own_motion, plausibility) ---
+# --- views that come one after the other (carried_field, keyframe_choice, reported_poses, plausibility) ---
 STEPS_A_KEYFRAME = 24  # steps for each new keyframe: with fewer, new regions stay blurred; with more, they come late
 # Newest keyframes of each camera, and share of the steps that they get: with more, earlier ones are forgotten.
 NEWEST, NEWEST_SHARE = 4, 0.4
@@ -88,7 +86,7 @@ EXPOSED_SHARE = 0.2  # share of its pixels that must be such, at least
 BARE = 0.05  # contrast (standard deviation) of a view that shows nothing; of redkitchen's views it is .15 and more
 BEGINS = (2, 4, 8)  # numbers of keyframes without depth at which a field begins anew
 
-# --- the pose of a new frame, by alignment with a rendering (carried_field, plausibility, tracking) ---
+# --- the pose of a new frame, by alignment with a rendering (carried_field, plausibility, pose_alignment) ---
 RENDERED_HALVINGS = 1  # halvings of the size that is rendered: half is as good, the finest level has it
 LEVELS = ((2, 3), (1, 3), (0, 2))  # for each level its further halvings and iterations: coarse to fine
 ALIGNMENTS = 2  # renderings: the second one from where the first led
@@ -100,7 +98,7 @@ SOFT = 0.1  # gray levels: what differs by more disagrees, and counts little
 PRIOR_RAD, PRIOR_M, PRIOR_ERROR = 0.02, 0.03, 1e-3
 LONGEST_RAD = 0.05  # largest rotation in a step
 
-# --- a camera located by its pictures, not its reported poses (carried_field, own_motion, plausibility, tracking) ---
+# --- a camera located by its pictures, not its reported poses (reported_poses, and those above) ---
 GUESSED_ERROR = 4e-5  # as PRIOR_ERROR, around a guess: five times as far costs as much
 ENOUGH_OVERLAP = 0.6  # share of pixels in view, above which more makes a guess no better
 DOUBTFUL = 0.9  # share of pixels that look as expected, below which another place than the reported one is tried
@@ -130,7 +128,7 @@ FOLLOWED = 0.1  # share of pixels by which fewer may look as expected where repo
 LONGEST_LEAP_S = 1.0
 FASTEST = 3.0  # times the last motion, which a camera may have made since
 
-# --- frames and poses that cannot be right (carried_field, own_motion, plausibility, tracking) ---
+# --- frames and poses that cannot be right (carried_field, reported_poses, plausibility, pose_alignment) ---
 # A frame is left out that has this share of the field in view, but fewer of its pixels as expected than the second.
 LEAST_OVERLAP, LEAST_AGREEING = 0.3, 0.5
 FLAT = 0.15  # share of the expected contrast, below which a lens is covered; an exposure of a third has 0.33

@@ -20,12 +20,13 @@ from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
-from edge_server.fields.splat.carried_camera.discs import usable_depth
-from edge_server.fields.splat.carried_camera.own_motion import OwnMotion, search
+from edge_server.fields.splat.carried_camera import keyframe_choice
+from edge_server.fields.splat.carried_camera.frame_stereo import sweep_depth
 from edge_server.fields.splat.carried_camera.plausibility import agreeing, flat, moved_in, troubles, unturned
+from edge_server.fields.splat.carried_camera.pose_alignment import Alignment, Rendered, align, gray
+from edge_server.fields.splat.carried_camera.reported_poses import OwnMotion, search
 from edge_server.fields.splat.carried_camera.scan_field import ScanField, Shown, aim_of
-from edge_server.fields.splat.carried_camera.sweep import sweep_depth
-from edge_server.fields.splat.carried_camera.tracking import Alignment, Rendered, align, gray
+from edge_server.fields.splat.carried_camera.seeds_on_depth import usable_depth
 from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 
@@ -62,7 +63,7 @@ class CarriedField(ScanField):
         news = [view for view in views if self._is_new(view)]
         if news and (not self._views or (self._bare and not all(_is_bare(view) for view in news))):
             self._begin(news)
-        due = self._due_before + self.step // tuned.STEPS_A_KEYFRAME + len(self._seen) - self._taken
+        due = self._due_before + keyframe_choice.due(self.step, len(self._seen), self._taken)
         best = {}
         for view in sorted(news, key=lambda view: (view.depth is not None, view.generated_ns)):
             best[view.camera] = view  # the newest, of those with depth if there are any: only they seed
@@ -157,8 +158,9 @@ class CarriedField(ScanField):
         if not self._measured and self._taken - self._blind in tuned.BEGINS:
             self._begin_anew()
         self._took_at = self.step
-        while len(self._views) > self._most_kept():
-            self._drop(self._least_needed())
+        h, w = view.image.shape[:2]
+        while len(self._views) > keyframe_choice.most_kept(h * w):
+            self._drop(keyframe_choice.least_needed([v.camera_to_world for v in self._views], self._distance_m()))
 
     @property
     def _founded(self) -> bool:
@@ -252,7 +254,7 @@ class CarriedField(ScanField):
         return last if recent else None
 
     def _search(self, view: View, goes_on: float = 0.0) -> tuple[NDArray[np.float64], float] | None:
-        """See ``own_motion.search``."""
+        """See ``reported_poses.search``."""
         last, before = self._has_depth_of(view), self._own.before(view, _carrier(view))
         if last is not None and (z := last.depth) is not None:
             kept = Rendered(self._pose_of(last), last.intrinsics, gray(last.image), z, np.ones_like(z))
@@ -372,25 +374,6 @@ class CarriedField(ScanField):
         sums = np.stack([np.ones_like(r), r, r * r, t, r * t]).sum(axis=1).T
         self._exposures.learn(view.camera, sums, whole=True)
 
-    # --- which keyframes stay -----------------------------------------------------------------
-
-    def _most_kept(self) -> int:
-        pixels = self._views[-1].image.shape[0] * self._views[-1].image.shape[1]
-        return min(max(tuned.KEPT_PIXELS // pixels, tuned.LEAST_KEPT), tuned.MOST_KEPT)
-
-    def _least_needed(self) -> int:
-        """The older of the two keyframes that were taken nearest to each other, the newest ones apart."""
-        old = self._views[: -tuned.NEWEST]
-        place = np.stack([v.camera_to_world for v in self._views])
-        apart = np.linalg.norm(place[:, None, :3, 3] - place[None, :, :3, 3], axis=2)
-        box = self.view_store.box
-        assert box is not None
-        turned = np.linalg.norm(place[:, None, :3, 2] - place[None, :, :3, 2], axis=2)
-        apart = apart / box.distance_m + turned
-        apart[np.arange(len(apart)), np.arange(len(apart))] = np.inf
-        apart = np.triu(apart)[: len(old)] + np.where(np.tri(len(apart), k=0)[: len(old)] > 0, np.inf, 0.0)
-        return int(np.argmin(apart.min(axis=1)))
-
     def _drop(self, k: int) -> None:
         """Learn from a keyframe no longer. Its correction stays, for held-out and late frames of its time."""
         gone = self._views[k]
@@ -407,14 +390,7 @@ class CarriedField(ScanField):
     # --- what the field asks for --------------------------------------------------------------
 
     def _next_view(self) -> int:
-        """The newest keyframe while it is fresh, else one of the newest, or any of them."""
-        rng, count = self._rng(7), len(self._views)
-        if self.step - self._took_at < tuned.FRESH_STEPS:
-            return count - 1
-        newest = min(tuned.NEWEST * len(self._seen), count)
-        if rng.random() < tuned.NEWEST_SHARE:
-            return count - 1 - int(rng.integers(newest))
-        return int(rng.integers(count))
+        return keyframe_choice.next_view(self._rng(7), len(self._views), len(self._seen), self.step - self._took_at)
 
     def _compare(self, view: int) -> NDArray[np.float64]:
         one = self._views[view]

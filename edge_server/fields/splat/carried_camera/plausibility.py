@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.cameras.constant_correction import constant_correction
+from edge_server.fields.common.cameras.mount_error import constant_correction
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
+from edge_server.fields.splat.carried_camera.pose_alignment import gray
 from edge_server.fields.splat.carried_camera.scan_field import Shown
-from edge_server.fields.splat.carried_camera.tracking import gray
 from freshfield.geometry import se3_inverse, so3_log
 
 Array = NDArray[np.float64]

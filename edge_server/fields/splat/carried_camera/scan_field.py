@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Correction, View
+from edge_server.fields.common.background import foreground_mask
 from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.common.cameras.pose_corrections import PoseCorrections, normal_matrix
-from edge_server.fields.common.plane_sweep import foreground_mask
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.common.view_store import Arrays, same_views
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
-from edge_server.fields.splat.carried_camera.discs import discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.carried_camera.exposures import Exposures
+from edge_server.fields.splat.carried_camera.frame_stereo import sweep_depth
 from edge_server.fields.splat.carried_camera.refined_cameras import RefinedCameras, ScanSnapshot
-from edge_server.fields.splat.carried_camera.sweep import sweep_depth
+from edge_server.fields.splat.carried_camera.seeds_on_depth import discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.densification import GaussianCloud, opacity
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import BETA1, BETA2
 from edge_server.fields.common.kernels.camera import SIZE, load_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import draw, is_finite, log32
+from edge_server.fields.field_constants import BETA1, BETA2
 from edge_server.fields.splat.kernels.project import BASE, BLOCK, COLOR, OPACITY, POSITION, QUATERNION, RADIUS, SCALE
 from edge_server.fields.splat.kernels.project_backward import (
     GRADIENT,

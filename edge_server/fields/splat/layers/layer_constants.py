@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-# --- when what begins (layered_field, static_layer, static_supervision, tracker, depth.depth_supervision) ---
+# --- when what begins (layered_field, static_layer, static_supervision, motion_tracker, depth.depth_supervision) ---
 LEAST_CAMERAS = 2  # fewest cameras for layers: one alone gives no depth, and the still field learns its frames
 PLATE_FRAMES, PLATE_S = 8, 3.2  # frames of each camera, and time since the first, before plates are certain
 # Time since the first frame at which layers begin, with what is known of the plates then: nine tenths in `room`. At
@@ -37,7 +37,7 @@ FIRST_FINE_EVERY_S, FINE_EVERY_S = 0.01, 0.05  # least time to the next such fra
 FINE_FRAMES = 4  # frames of each camera before the still field learns from fine plates
 FINE_MEMORY, FINE_KNOWN = 16, 3  # frames that a fine plate is the mean of; fewest that make it known
 
-# --- exposures (exposures, plates, static_supervision, kernels.plates, depth.overlaps) ---
+# --- exposures (equal_exposures, plates, static_supervision, kernels.plates, depth.overlaps) ---
 EXPOSURE_ROUNDS, EXPOSURE_STEPS = 6, 25  # fits in which cameras agree on an exposure, and steps of each
 EXPOSURES_AGREE = 0.02  # standard deviation of log exposures over the cameras, up to which they agree
 EXPOSURE_RATE = 1.6  # factor on a correction: after so few steps some six tenths of a difference show
@@ -94,7 +94,7 @@ NEAR_FOREGROUND_PX = 5  # width of the square by which the foreground grows, whe
 BACKGROUND_WEIGHT = 0.5  # weight of the other pixels
 OCCLUDED_M = 0.15  # by which the still field is nearer than the moving set where pixels do not count
 
-# --- the moving set (layered_field, moving_set, tracker) ---
+# --- the moving set (layered_field, moving_set, motion_tracker) ---
 GAUSSIANS, ANCHORS = 1500, 24  # for a foreground of USUAL_SHARE of the pixels
 USUAL_SHARE = 0.062  # share of the pixels that is foreground usually
 # The capacity follows the foreground, in multiples of USUAL_SHARE: up at once, to the first at most; down by the second
@@ -116,7 +116,7 @@ MISSING_ERROR = 0.12  # color error, in the worst channel, above which foregroun
 SEEDS_A_PIXEL = 0.1  # new Gaussians for each pixel that needs them
 FEW = 32  # Gaussians, below which all foreground needs new ones
 
-# --- few cameras (layered_field, moving_set, plates, static_supervision, tracker, depth.depth_supervision) ---
+# --- few cameras (layered_field, moving_set, plates, static_supervision, motion_tracker, depth.depth_supervision) ---
 # Up to four views leave more of the motion open: it is bound more tightly, has more anchors, and is seeded sooner.
 # Accelerations and speeds are at most the cameras' distance to the scene, a second squared and a second: what is seen
 # from near is small and slow.
@@ -133,7 +133,7 @@ FEW_ANCHORS, FEW_ACCELERATION_M_PER_S2, FEW_NEIGHBOR_M_PER_S, FEW_SEED_EVERY_S =
 FEW_STEPS, FEW_STEPS_PIXELS = 6, 20_000
 FEW_MOST_ANCHORS = 48  # anchors at most, however large the foreground: the time of an update grows with their square
 
-# --- following motion (tracker) ---
+# --- following motion (motion_tracker) ---
 # Most passes of Gauss-Newton over a stride, and the median movement of anchors that calls for another pass.
 PASSES, AGAIN_M = 3, 0.02
 ALIGNING_SHARE = 0.5  # largest share of a budget in seconds that alignment may take
@@ -144,7 +144,7 @@ SEED_EVERY_S = 0.2  # time between seedings
 SEED_AT_LEAST_EVERY_S = 0.6  # longest time between seedings, even if budgets have no room for one
 ANCHORS_EVERY_S = 1.0  # time between choices of new anchors
 
-# --- motion (motion, moving_set, observations, tracker, kernels.align, page.splats.published) ---
+# --- motion (motion, moving_set, observations, motion_tracker, kernels.align, page.splats.published) ---
 KNOTS_PER_S = 15  # instants a second at which displacements are solved for
 FREE, FIXED = 10, 3  # knots solved for, and older ones before them
 PERSISTENCE = 0.9  # share of the acceleration that is kept from knot to knot

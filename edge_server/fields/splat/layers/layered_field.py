@@ -31,6 +31,7 @@ from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import COLOR, Gaussians
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.layered_state import pack, unpack
+from edge_server.fields.splat.layers.motion_tracker import MotionTracker
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import (
     FixedCamera,
@@ -43,7 +44,6 @@ from edge_server.fields.splat.layers.observations import (
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
 from edge_server.fields.splat.layers.static_layer import StaticLayer
 from edge_server.fields.splat.layers.static_supervision import StaticSupervision
-from edge_server.fields.splat.layers.tracker import MotionTracker
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from freshfield.geometry import Pinhole

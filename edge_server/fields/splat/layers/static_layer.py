@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Budget, Rendering, View
-from edge_server.fields.common.field_constants import LOSS_STEPS
 from edge_server.fields.common.field_state import give_attributes, take_attributes
 from edge_server.fields.common.threads.thread_pool import lower_priority
 from edge_server.fields.common.training_schedule import StepBudget
+from edge_server.fields.field_constants import LOSS_STEPS
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers import layer_constants as tuned

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edge_server.fields import Budget, View
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.splat.layers import layer_constants as tuned
-from edge_server.fields.splat.layers.exposures import equalize_exposures
+from edge_server.fields.splat.layers.equal_exposures import equalize_exposures
 from edge_server.fields.splat.layers.observations import FixedCamera, Observations
 from edge_server.fields.splat.layers.plates import plain_share
 from edge_server.fields.splat.layers.static_layer import PlateImage, StaticLayer

@@ -18,7 +18,7 @@ from camera_node.robot.calibration.lens_calibration import calibrate_lens
 from camera_node.robot.calibration.rig import rig_inputs
 from camera_node.robot.calibration.rig.rig_calibration import calibrate_rig
 from camera_node.robot.calibration.targets import WHICH_PRINT, Corners, estimate_pose, parse_target
-from camera_node.sources.rig_calibration import load_calibration
+from camera_node.sources.calibration_file import load_calibration
 from freshfield.clock import WallClock
 from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp, so3_log
 from tests.camera_node.robot.calibration import known_truth

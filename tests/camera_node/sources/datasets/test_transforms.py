@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from camera_node.sources.calibration_file import load_calibration
 from camera_node.sources.datasets.lens import Lens, pinhole
 from camera_node.sources.datasets.photo import ImageOptions, Photo
 from camera_node.sources.datasets.records import DatasetError
@@ -17,7 +18,6 @@ from camera_node.sources.datasets.transforms import load_dataset
 from camera_node.sources.datasets.transforms_keys import REFUSED
 from camera_node.sources.datasets.video import Clip
 from camera_node.sources.datasets.video import load_dataset as load_videos
-from camera_node.sources.rig_calibration import load_calibration
 from freshfield.geometry import Pinhole, look_at, se3_inverse
 from freshfield.scenario import ScenarioError, parse
 from tests.camera_node.sources.datasets import photos

@@ -7,12 +7,13 @@ import pytest
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
 from edge_server.fields import Budget, View
-from edge_server.fields.common.field_constants import GUIDE_RAYS
+from edge_server.fields.common.background import foreground_mask
 from edge_server.fields.common.kernels.rays import Views
-from edge_server.fields.common.plane_sweep import _square_centers, depth_guide, foreground_mask
+from edge_server.fields.common.plane_sweep import _square_centers, depth_guide
 from edge_server.fields.common.scene_box import SceneBox, scene_box
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.threads.thread_pool import shared_pool
+from edge_server.fields.field_constants import GUIDE_RAYS
 from tests.edge_server.fields.scenes import ring, seen
 from tests.edge_server.fields.small import SEEN, SMALL, cut_out, small
 

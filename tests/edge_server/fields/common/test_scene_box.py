@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from edge_server.experiments.scenes.multiview_still import synthetic_still
-from edge_server.fields.common.scene_box import plain_background, scene_box
+from edge_server.fields.common.background import plain_background
+from edge_server.fields.common.scene_box import scene_box
 from freshfield.geometry import look_at
 from tests.edge_server.fields.scenes import ring
 

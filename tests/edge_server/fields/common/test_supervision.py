@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from edge_server.fields import Budget, View
-from edge_server.fields.common.field_constants import CHANGE
 from edge_server.fields.common.supervision import FARTHEST_M, check_view, moved_pixels
+from edge_server.fields.field_constants import CHANGE
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.small import tiny
 from tests.support import refused

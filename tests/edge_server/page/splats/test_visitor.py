@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from channel_emu.live.live_emulator_constants import PIECE_BYTES, RESEND_AFTER_S
-from edge_server.page.splats import browser_splat_constants as tuned
 from edge_server.page.splats import messages
+from edge_server.page.splats import splat_stream_constants as tuned
 from edge_server.page.splats.published import Published, Publisher
 from edge_server.page.splats.records import from_records
 from edge_server.page.splats.visitor import LinkWindow, Visitor

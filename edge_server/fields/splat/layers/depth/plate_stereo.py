@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import SAME_POSE
 from edge_server.fields.common.threads.thread_pool import Pool
+from edge_server.fields.field_constants import SAME_POSE
 from edge_server.fields.splat.kernels.semi_global import UNKNOWN
 from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.depth_plate import smooth

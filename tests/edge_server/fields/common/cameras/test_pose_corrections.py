@@ -8,7 +8,7 @@ import pytest
 from edge_server.fields import View
 from edge_server.fields.common.cameras import camera_refinement_constants as tuned
 from edge_server.fields.common.cameras.appearance import AppearanceEmbeddings
-from edge_server.fields.common.cameras.constant_correction import constant_correction
+from edge_server.fields.common.cameras.mount_error import constant_correction
 from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrections, normal_matrix
 from freshfield.geometry import Pinhole, look_at, se3, se3_inverse, so3_exp, so3_log, world_rays
 from tests.edge_server.fields.small import SEEN

@@ -4,11 +4,11 @@ import numpy as np
 import torch
 from numba import njit
 
-from edge_server.fields.common.field_constants import PARAMETER_LIMIT
 from edge_server.fields.common.kernels.adam import Rule, adam
 from edge_server.fields.common.kernels.hash_grid import SEGMENT
 from edge_server.fields.common.kernels.jit import FAST
 from edge_server.fields.common.kernels.simd import exp32, log32, uniform
+from edge_server.fields.field_constants import PARAMETER_LIMIT
 
 VERTICES = SEGMENT * 8
 

@@ -10,7 +10,6 @@ import torch
 from numba import njit
 from numpy.typing import NDArray
 
-from edge_server.fields.common.field_constants import HORIZON
 from edge_server.fields.common.kernels.occupancy import Cells, sample_density, threshold
 from edge_server.fields.common.kernels.rays import COARSE, NEVER, Space, interval, march, pixel_direction, unit_cube
 from edge_server.fields.common.kernels.volume_rendering import RAW_HIGH, RAW_LOW
@@ -19,6 +18,7 @@ from edge_server.fields.common.scene_box import scene_box
 from edge_server.fields.common.supervision import CameraMemory, lens_row
 from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.common.view_store import ViewStore
+from edge_server.fields.field_constants import HORIZON
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.small import KERNEL_SETTINGS as SETTINGS
 from tests.edge_server.fields.small import KERNEL_VIEWS as VIEWS

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from edge_server.fields import View
-from edge_server.fields.common.field_constants import GUIDE_REACH
 from edge_server.fields.common.kernels import volume_rendering as volume
 from edge_server.fields.common.kernels.train import RaySampling, train_chunks
 from edge_server.fields.common.supervision import pack_views
 from edge_server.fields.common.training_schedule import step_length
+from edge_server.fields.field_constants import GUIDE_REACH
 from edge_server.fields.ngp.field import NgpField
 from tests.edge_server.fields.small import KERNEL_SETTINGS as SETTINGS
 from tests.edge_server.fields.small import KERNEL_VIEWS as VIEWS

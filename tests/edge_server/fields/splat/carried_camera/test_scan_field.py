@@ -14,8 +14,8 @@ from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Budget, RefinesCameras, View
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.carried_camera import scan_field
+from edge_server.fields.splat.carried_camera.frame_stereo import sweep_depth
 from edge_server.fields.splat.carried_camera.scan_field import ScanField
-from edge_server.fields.splat.carried_camera.sweep import sweep_depth
 from edge_server.fields.splat.densification import opacity
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import se3, so3_exp

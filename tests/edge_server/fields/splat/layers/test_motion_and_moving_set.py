@@ -18,11 +18,11 @@ from edge_server.fields.splat.layers.depth.body_depth import measured_frames
 from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
 from edge_server.fields.splat.layers.layer_constants import FIXED, FREE, KNOTS_PER_S, MAX_AHEAD_S, STRIDE_S
 from edge_server.fields.splat.layers.motion import DIFFERENCES, WINDOW, Motion, ViewRow
+from edge_server.fields.splat.layers.motion_tracker import MotionTracker
 from edge_server.fields.splat.layers.moving_set import MovingSet
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 from edge_server.fields.splat.layers.plates import Plate
 from edge_server.fields.splat.layers.snapshot import MovingSnapshot
-from edge_server.fields.splat.layers.tracker import MotionTracker
 from edge_server.fields.splat.settings import SplatSettings
 from tests.edge_server.fields.scenes import BALL_M, RADIUS_M, ring, seen
 

@@ -11,7 +11,7 @@ from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.exposures import Exposures
 from edge_server.fields.splat.carried_camera.plausibility import moved_in, troubles, unturned
-from edge_server.fields.splat.carried_camera.tracking import Rendered, align
+from edge_server.fields.splat.carried_camera.pose_alignment import Rendered, align
 from freshfield.geometry import Pinhole, se3, se3_inverse, so3_exp
 from tests.edge_server.fields.common.cameras.test_pose_corrections import arm_poses
 from tests.edge_server.fields.splat.carried_camera.carried import LENS

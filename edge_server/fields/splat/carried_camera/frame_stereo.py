@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import View
-from edge_server.fields.common.plane_sweep import foreground_mask
+from edge_server.fields.common.background import foreground_mask
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.kernels.semi_global import UNKNOWN

@@ -17,12 +17,15 @@ FAR_AWAY = 10.0  # times the usual distance between cameras: nearer ones belong 
 OUTWARDS = 0.5  # length of the mean of the cameras' axes, below which they look outwards from where they stand
 # Distance of a scene that nothing tells: times the cameras' extent; in meters, where all cameras are at one place.
 GUESSED_SPREADS, GUESSED_M = 3.0, 3.0
-PLAIN_STEPS = 8  # steps of 255: a plain background varies by no more than this
-# A background is plain where this share of a picture's edge is; the pictures may miss it up to this percentile.
-PLAIN_EDGE, PLAIN_PERCENTILE = 0.6, 20
 SEEN_PERCENTILE = 10  # of the radii that cameras see whole: nine of ten cameras see the box of an object whole
 FINAL_BOX_CAMERAS = 4  # cameras from which on a scene's box is kept
 SIMILAR_BOX = 0.1  # share of its radius by which a box found anew may differ: what was learned in the old one is kept
+
+# --- what is behind the scene (background) ---
+PLAIN_STEPS = 8  # steps of 255: a plain background varies by no more than this
+# A background is plain where this share of a picture's edge is; the pictures may miss it up to this percentile.
+PLAIN_EDGE, PLAIN_PERCENTILE = 0.6, 20
+EMPTY_COLOR, EMPTY_ALPHA = 0.06, 16  # distance of a color, summed over channels, and alpha below which a pixel is empty
 
 # --- cameras (camera_rows, plane_sweep, settings, supervision, cameras.pose_corrections, splat.layers) ---
 MIN_NEAR = 0.01  # scene units: the nearest that a camera's near plane may be
@@ -81,7 +84,6 @@ LOSS_STEPS = 32  # latest steps of a fit whose mean loss is reported
 SWEEP_TOLERANCE = 0.08  # between colors, summed over channels: with more, walls are found where there are none
 SWEEP_VIEWS = 32  # largest number of views that vote, below ``kernels.plane_sweep.UNMARKED``
 EMPTY_VIEWS = 2  # a cell is empty if this many views see plain background there
-EMPTY_COLOR, EMPTY_ALPHA = 0.06, 16  # distance of a color, summed over channels, and alpha below which a pixel is empty
 SWEEP_MIDDLE = 0.03  # of a score, that a distance e times as large, or as small, as the cameras' to the scene costs
 GUIDE_CELLS = 96  # a side: finer cells hardly guide better, and cost their cube
 GUIDE_RAYS = 1 << 16  # rays swept at most; the pixels between two rays share their depth
@@ -108,13 +110,12 @@ NERFACTO_WEIGHT_FLOOR = 1e-3  # in the interlevel loss's denominator, so that a 
 # --- the vector-matrix field (tensorf.field) ---
 TENSORF_FINEST = 256  # vertices a side by default: finer planes outgrow the second-level cache
 
-# --- threads (threads.brief_wait, threads.thread_pool, experiments.engine.engine, live.server) ---
+# --- threads (threads.brief_wait, threads.thread_pool, experiments.engine.engine) ---
 # Looks of a wait, each followed by a pause of the core, of 30 to 140 cycles: 20 to 90 us; without a pause (not x86) a
 # few. Within a training step the next kernel comes within 50 us; to be woken takes 30 to 70 us on two shared cores.
 WAIT_LOOKS = 2000
 # Workers of a pool: more gain nothing, or lose, as each takes the GIL once a job (docs/results/gpu/threads.json).
 MOST_WORKERS = 8
-SERVER_NICE = 5  # niceness of workers in a server that answers cameras meanwhile
 
 # --- while kernels are compiled (fields.compiling) ---
 # Between two lines of the log: a long compilation shows that it goes on, and a short one is a single line.

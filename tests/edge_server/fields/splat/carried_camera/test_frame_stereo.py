@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from edge_server.fields import View
 from edge_server.fields.common.threads.thread_pool import shared_pool
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
-from edge_server.fields.splat.carried_camera.discs import discs, filled, quadtree, usable_depth
-from edge_server.fields.splat.carried_camera.sweep import neighbors, sweep_depth
+from edge_server.fields.splat.carried_camera.frame_stereo import neighbors, sweep_depth
+from edge_server.fields.splat.carried_camera.seeds_on_depth import discs, filled, quadtree, usable_depth
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE
 from freshfield.geometry import Pinhole, look_at, quaternion_to_matrix, so3_exp, world_rays
 from tests.edge_server.fields.scenes import seen

@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from camera_node.robot.arm.arm_constants import LEAST_REACHED, LEAST_STATES, LISTEN_S
+from camera_node.doctor import doctor_constants as tuned
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes, mount_on_flange
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.settings import ArmConfig, PathConfig
@@ -40,13 +40,13 @@ def joint_states(arm: ArmConfig) -> str:
     stream.start()
     try:
         before = stream.received
-        time.sleep(LISTEN_S)
-        samples, trouble = (stream.received - before) / LISTEN_S, stream.trouble
+        time.sleep(tuned.ARM_LISTEN_S)
+        samples, trouble = (stream.received - before) / tuned.ARM_LISTEN_S, stream.trouble
     finally:
         stream.stop()
     if trouble:
         raise ValueError(f"{trouble}: see the teach pendant; poses are right all the same")
-    if samples < LEAST_STATES * arm.frequency_hz:
+    if samples < tuned.ARM_LEAST_STATES * arm.frequency_hz:
         raise ValueError(
             f"{samples:.0f} joint states a second of {arm.frequency_hz:g}: is the network or this machine busy?"
         )
@@ -59,6 +59,6 @@ def path(scenario: Scenario, arm: ArmConfig, tour_path: PathConfig) -> str:
     tour = plan_tour(model, base, mount, tour_path)
     count = len(viewpoints(tour_path))
     summary = f"the arm reaches {tour.reached} of {count} viewpoints"
-    if tour.reached >= LEAST_REACHED * count:
+    if tour.reached >= tuned.ARM_LEAST_REACHED * count:
         return summary
     raise ValueError(f"{summary}: change radius_m, elevations_deg, azimuths_deg or where the base stands")

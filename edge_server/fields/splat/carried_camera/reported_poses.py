@@ -14,7 +14,7 @@ from edge_server.fields import View
 from edge_server.fields.common.cameras.pose_corrections import Leap, PoseCorrection, PoseCorrections
 from edge_server.fields.common.field_state import from_json, to_json
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
-from edge_server.fields.splat.carried_camera.tracking import Gray, Rendered, align, align_from, gray
+from edge_server.fields.splat.carried_camera.pose_alignment import Gray, Rendered, align, align_from, gray
 from freshfield.geometry import se3, se3_inverse, so3_exp, so3_log
 
 Array = NDArray[np.float64]
