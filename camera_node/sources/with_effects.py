@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from camera_node.settings import SourceConfig, errors_of
+from camera_node.settings import SourceConfig, WorldConfig, errors_of
 from camera_node.sources.base import Derived, Shot, Source, pixels
 from freshfield.depth import DepthImage
 from freshfield.scenario import Scenario, ScenarioError
@@ -37,6 +37,13 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
         raise ScenarioError(
             f"{scenario.path}: source.effects: effects of the kinds delay and mount need source kind world"
         )
+    if isinstance(config, WorldConfig) and effects.mount:
+        arm = () if config.arm is None else config.arm.cameras
+        if camera in (*config.carried, *arm):
+            raise ScenarioError(
+                f"{scenario.path}: source.effects: {camera} is carried, and a bump (kind mount) turns a camera that "
+                "stands still: leave it out, or name those that do in its cameras"
+            )
     return effects
 
 
