@@ -338,8 +338,7 @@ class Pinhole:
         x, y = (u - self.cx) / self.fx, (v - self.cy) / self.fy
         if self.distorted:
             x, y = self._undistort(x, y)
-        d = np.stack([x, y, np.ones_like(x)], axis=-1)
-        return d / np.linalg.norm(d, axis=-1, keepdims=True)
+        return _unit_rays(x, y)
 
     def project(self, points: ArrayLike) -> Array:
         """Pixels (..., 2) of points (..., 3) in camera axes; NaN for points that are not in front."""
@@ -360,6 +359,23 @@ class Pinhole:
         )
 
     def _undistort(self, xd: Array, yd: Array) -> tuple[Array, Array]:
+        """The point that the lens shows at (xd, yd). Two of Newton's steps end what is left of ``_nearly_undistorted``:
+        of wide lenses up to a pixel at the corners."""
+        k1, k2, p1, p2 = self.distortion
+        x, y = self._nearly_undistorted(xd, yd)
+        for _ in range(2):
+            r2 = x * x + y * y
+            radial, slope = 1.0 + r2 * (k1 + r2 * k2), 2.0 * (k1 + 2.0 * r2 * k2)
+            # The Jacobian, which is symmetric: distortion is a gradient.
+            xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+            xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+            yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+            at_x, at_y = self._distort(x, y)
+            ex, ey, determinant = at_x - xd, at_y - yd, xx * yy - xy * xy
+            x, y = x - (yy * ex - xy * ey) / determinant, y - (xx * ey - xy * ex) / determinant
+        return x, y
+
+    def _nearly_undistorted(self, xd: Array, yd: Array) -> tuple[Array, Array]:
         # Fixed-point iteration, OpenCV's way; eight rounds reach 1e-6 for lenses met in practice.
         k1, k2, p1, p2 = self.distortion
         x, y = xd, yd
@@ -370,6 +386,12 @@ class Pinhole:
             dy = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
             x, y = (xd - dx) / radial, (yd - dy) / radial
         return x, y
+
+
+def _unit_rays(x: Array, y: Array) -> Array:
+    """Unit directions (..., 3) of undistorted points (...) at depth 1."""
+    d = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
 def world_rays(camera: Pinhole, camera_to_world: ArrayLike) -> tuple[Array, Array]:
@@ -398,15 +420,14 @@ _RASTER_POINTS = 33  # points a side at which a lens is checked
 # All frames of a camera have the same lens; the cache is bounded because a hostile sender's may differ.
 @lru_cache(maxsize=1024)
 def invertible(camera: Pinhole) -> bool:
-    """Whether the lens model can be inverted: undistortion followed by projection returns each point of a
-    grid over the whole image, edges included, within MAX_LENS_ERROR_PX. Undistortion diverges for
+    """Whether the lens model can be inverted: undistortion, before its last steps, followed by projection returns each
+    point of a grid over the whole image, edges included, within MAX_LENS_ERROR_PX. Undistortion diverges for
     coefficients that no real lens has."""
     if not camera.distorted:
         return True
     u, v = np.meshgrid(np.linspace(0.0, camera.width, _RASTER_POINTS), np.linspace(0.0, camera.height, _RASTER_POINTS))
-    points = np.stack([u.ravel(), v.ravel()], axis=-1)
     with np.errstate(all="ignore"):
-        rays = camera.rays(points)
-        error_px = np.abs(camera.project(rays) - points)
+        rays = _unit_rays(*camera._nearly_undistorted((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy))
+        error_px = np.abs(camera.project(rays) - np.stack([u, v], axis=-1))
     # A NaN compares as False.
     return bool(np.isfinite(rays).all() and (error_px <= MAX_LENS_ERROR_PX).all())

@@ -143,6 +143,8 @@ def test_rays_undo_projection(camera, seed):
     rays = camera.rays(camera.project(points))
     np.testing.assert_allclose(rays, points / np.linalg.norm(points, axis=1, keepdims=True), atol=2e-4)
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
+    wide = Pinhole(640, 480, 400, 400, 320, 240, (-0.22, 0.03, 1e-3, -1e-3))  # nearly folds at its corners
+    np.testing.assert_allclose(wide.project(wide.rays([[0, 0], [640, 480]])), [[0, 0], [640, 480]], atol=1e-6)
 
 
 @given(st.integers(8, 200), st.integers(8, 200), st.floats(20, 120), st.sampled_from([0.25, 0.5, 1 / 3, 2.0]))

@@ -51,7 +51,7 @@ def _march(space: Space, o, d, jitter: float = 0.0, room=slice(0, 500), opaque=N
     return x[:, room.start : n], ts[room.start : n], dts[room.start : n], depth
 
 
-@pytest.mark.parametrize("distortion", [(0, 0, 0, 0), (0.06, -0.08, -0.001, 0.0002)])
+@pytest.mark.parametrize("distortion", [(0, 0, 0, 0), (0.06, -0.08, -0.001, 0.0002), (-0.3, 0.03, 0.01, 0.005)])
 def test_directions_are_those_of_the_pinhole_camera(distortion: tuple) -> None:
     camera = Pinhole(40, 30, 35.0, 36.0, 19.0, 16.0, distortion)
     pose = look_at((1.0, 2.0, 3.0), (0.0, 0.0, 0.0))
