@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from functools import partial
+from pathlib import Path
 
 from camera_node.pose.providers import Closable, FixedPose, PoseProvider
 from camera_node.settings import FIRST_FRAME_S, LIVE_FPS, LiveConfig, beside
@@ -185,7 +186,7 @@ def open_live(
             if camera not in config.devices:
                 raise ScenarioError(f"{scenario.path}: source.devices.{camera}: missing: which camera is it?")
     # Of the cameras of this node: another machine's may have the same number.
-    devices = [str(config.devices[camera]) for camera in cameras if camera in config.devices]
+    devices = [_spelt_out(config, str(config.devices[camera])) for camera in cameras if camera in config.devices]
     if doubles := [device for device in devices if devices.count(device) > 1]:
         raise ScenarioError(f"{scenario.path}: source.devices: more than one camera is {doubles[0]}")
     fps, clock = rate(config.fps or LIVE_FPS), WallClock()
@@ -209,6 +210,13 @@ def open_live(
                 opened.close()
         raise
     return sources
+
+
+def _spelt_out(config: LiveConfig, device: str) -> str:
+    """A device as no other is called: 0, /dev/video0 and a link to that are one."""
+    if config.kind != "camera" or "://" in device:
+        return device
+    return str(Path(f"/dev/video{device}" if device.isdecimal() else device).resolve())
 
 
 def calibrations(scenario: Scenario, config: LiveConfig) -> dict[str, CalibratedCamera]:

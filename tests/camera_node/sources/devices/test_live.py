@@ -122,6 +122,7 @@ def test_the_lens_is_the_calibrations_scaled_to_the_pictures_and_missed_only_wit
 
 def test_a_camera_that_fails_leaves_no_other_one_open(tmp_path, monkeypatch):
     first, arm = Feed(), MagicMock(**{"at.return_value": STANDING.at(0)})
+    (tmp_path / "by-id").symlink_to("/dev/video0")
 
     def open_feed(camera, config, fps, clock):
         if camera == "other":
@@ -133,9 +134,11 @@ def test_a_camera_that_fails_leaves_no_other_one_open(tmp_path, monkeypatch):
     monkeypatch.setattr(live, "_poses", lambda *_: {"eye": arm, "other": STANDING})
     monkeypatch.setattr(live, "open_feed", open_feed)
     refused(CameraError, "other: no camera", live.open_live, plan, source_config(plan), plan.cameras)
-    source["devices"] = {"eye": 0, "other": "0"}
-    twice = parse({"cameras": {"ids": ["eye", "other"]}, "source": source}, plan.path)
-    refused(ScenarioError, "more than one camera is 0", live.open_live, twice, source_config(twice), twice.cameras)
+    for other in ("0", str(tmp_path / "by-id")):  # the number, and a link to what it stands for
+        source["devices"] = {"eye": 0, "other": other}
+        twice = parse({"cameras": {"ids": ["eye", "other"]}, "source": source}, plan.path)
+        says = "more than one camera is /dev/video0"
+        refused(ScenarioError, says, live.open_live, twice, source_config(twice), twice.cameras)
     live.open_live(twice, source_config(twice), ["eye"])["eye"].close()  # the other is another machine's
     assert first.closed and arm.close.called
     assert "camera eye" not in [thread.name for thread in threading.enumerate()]
