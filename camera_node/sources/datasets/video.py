@@ -144,9 +144,10 @@ class Clip:
         self.count = int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
         capture.release()
         self._from_first_ms, first_s = _stamps(path, self.fps)
-        if len(self._from_first_ms) > 1 and bool((np.diff(self._from_first_ms) > 0).all()):
-            self.count = len(self._from_first_ms)
-        else:  # a container without stamps
+        # Of a container that does not stamp each frame (MPEG-PS), OpenCV's number of frames is a guess.
+        self.count = len(self._from_first_ms) or self.count
+        self._stamped = len(self._from_first_ms) > 1 and bool((np.diff(self._from_first_ms) > 0).all())
+        if not self._stamped:
             self._from_first_ms = 1e3 / self.fps * np.arange(self.count, dtype=np.float64)
         if self.count < 1:
             raise DatasetError(f"{path}: the video says it has no frames")
@@ -189,11 +190,13 @@ class Clip:
         if self._capture is None:
             self._capture = self._open()
         if not self._next <= index <= self._next + tuned.SKIP_FRAMES:
-            # OpenCV seeks by the mean rate: where that led, the stamp of the next frame tells.
-            self._capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, index - (1 if self.even else tuned.SKIP_FRAMES)))
-            found = self._capture.grab()
-            stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
-            self._next = int(np.abs(self._from_first_ms - stamp_ms).argmin()) + 1
+            found = self._stamped
+            if found:
+                # OpenCV seeks by the mean rate: where that led, the stamp of the next frame tells.
+                self._capture.set(cv2.CAP_PROP_POS_FRAMES, max(0, index - (1 if self.even else tuned.SKIP_FRAMES)))
+                found = self._capture.grab()
+                stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
+                self._next = int(np.abs(self._from_first_ms - stamp_ms).argmin()) + 1
             if not found or self._next > index:  # too far, or a container without an index: decode forward
                 self._capture.release()
                 self._capture, self._next = self._open(), 0

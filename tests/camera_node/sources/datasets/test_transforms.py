@@ -419,6 +419,16 @@ def test_frames_before_the_edit_list_of_a_cut_video_are_none(tmp_path):
     assert [round((clip.frame(k, 64, 48).mean() - 13) / 6) for k in (9, 0, 7)] == [11, 2, 9]
 
 
+def test_a_container_that_does_not_stamp_each_frame_loses_none(tmp_path):
+    video = cv2.VideoWriter(str(tmp_path / "a.mpg"), cv2.VideoWriter.fourcc(*"MPG1"), 25.0, (64, 48))
+    for k in range(120):
+        video.write(np.full((48, 64, 3), 16 + 6 * (k % FRAMES), np.uint8))
+    video.release()
+    clip = Clip(tmp_path / "a.mpg")
+    assert clip.count == 120
+    assert [round((clip.frame(k, 64, 48).mean() - 13) / 6) % FRAMES for k in (119, 0, 99, 57)] == [39, 0, 19, 17]
+
+
 def test_a_rotation_tag_is_followed_unless_the_calibration_is_of_the_stored_frames(tmp_path):
     file = write_rig(tmp_path)
     video = tmp_path / "videos/cam01.mp4"
