@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import View
+from edge_server.fields import Correction, View
 from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.cameras.camera_refinement import CameraRefinement
 from edge_server.fields.common.field_state import load_arrays
@@ -76,6 +76,13 @@ class TrainedField(SteppedField[RaySnapshot]):
             return loss, int(batch.rays.sum()), int(batch.samples.sum()), dropped
 
         return one_step
+
+    def correction(self, view: View) -> Correction | None:
+        """See ``fields.RefinesCameras``: the pose alone, of a view that it learns from. Appearances are learned apart,
+        and no other camera's error tells that of a view that is held out."""
+        poses = self._cameras.poses
+        learned = None if poses is None else poses.learned_pose(view)
+        return None if learned is None else Correction(learned, np.ones(3), np.zeros(3))
 
     def _live(self) -> RaySnapshot:
         return RaySnapshot(

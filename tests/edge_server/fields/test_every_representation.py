@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edge_server.export.viewed_field import ViewedField
 from edge_server.fields import Budget
 from edge_server.fields.common.cameras import camera_refinement_constants as refinement
 from edge_server.fields.common.kernels.volume_rendering import Weights
@@ -92,6 +93,9 @@ def test_resuming_continues_bit_for_bit(name: str, monkeypatch: pytest.MonkeyPat
         origin = a._cameras.corrected(made.SEEN, pack_cameras(made.SEEN, box), box).origin
         learned = np.stack([a._cameras.poses.pose(view)[:3, 3] for view in made.SEEN])
         np.testing.assert_array_equal(origin, box.normalise(learned))
+        exported = np.stack([ViewedField(name, b, b.views).pose(view)[:3, 3] for view in made.SEEN])
+        np.testing.assert_array_equal(exported, learned)
+        assert a.correction(made.HELD) is None, "its error is not known"
         assert any(np.abs(shift).max() > 0 for _, shift, *_ in a._cameras.meta()["poses"].values())
 
 
