@@ -85,6 +85,11 @@ def scaled_model(folder: Path, first: str, second: str, meters: str) -> tuple[st
     for name in (first, second):
         if name not in images:
             raise CalibrationError(f"--length: the model has no camera {name}; it has {', '.join(list(images)[:8])}")
+    if bent := [name for name, image in images.items() if image.path is None]:
+        raise CalibrationError(
+            f"{folder}: {bent[0]}: the model's pictures are straightened or turned when they are read, and a camera's "
+            "are not: let COLMAP use the camera model OPENCV, with pictures as they are stored"
+        )
     apart = math.dist(*(images[name].camera_to_world[:3, 3] for name in (first, second)))
     if not apart > 1e-9:
         raise CalibrationError(f"--length: {first} and {second} stand at one place in the model")

@@ -256,6 +256,8 @@ def test_a_colmap_model_is_scaled_by_a_known_length(tmp_path, capsys):
     for name, camera in load_calibration(out).items():
         np.testing.assert_allclose(camera.pose.matrix(), POSES[name[:4]], atol=1e-6)
     assert "no camera cam9; it has cam0" in refusal(capsys, main, *words, "cam9", apart)
+    sets.write_colmap(tmp_path, cameras, "OPENCV_FISHEYE", binary=False)
+    assert "cam0 x: the model's pictures are straightened" in refusal(capsys, main, *words, "cam2 x", apart)
 
 
 LENS = Pinhole(400, 300, 330.0, 332.0, 203.0, 148.0, (-0.05, 0.02, 0.001, -0.001))
