@@ -45,7 +45,9 @@ class OpenCvFeed(Feed):
             (cv2.CAP_PROP_FRAME_WIDTH, config.width),
             (cv2.CAP_PROP_FRAME_HEIGHT, config.height),
             (cv2.CAP_PROP_FPS, float(fps)),
-            (cv2.CAP_PROP_BUFFERSIZE, 1),
+            # One is filled while OpenCV decodes the other, which it gives back to V4L2 only then: with one alone a
+            # camera loses the frame that begins meanwhile, and with it up to half of its rate.
+            (cv2.CAP_PROP_BUFFERSIZE, 2),
         ):
             self._capture.set(key, value)  # an unsupported value is ignored; the images show the real size
         if config.exposure_us is not None:

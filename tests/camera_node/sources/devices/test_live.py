@@ -6,6 +6,7 @@ from fractions import Fraction
 from pathlib import Path
 from unittest.mock import MagicMock
 
+import cv2
 import numpy as np
 import pytest
 
@@ -149,7 +150,8 @@ class Capture:
 
     def __init__(self, ages_ms):
         self._ages_ms = list(ages_ms)
-        self.set = lambda key, value: True
+        self.given: dict[int, float] = {}
+        self.set = self.given.__setitem__
         self.get = lambda key: self._stamp_ms
         self.getBackendName = lambda: "V4L2"
         self.retrieve = lambda: (True, np.zeros((SIZE[1], SIZE[0], 3), np.uint8))
@@ -168,7 +170,8 @@ class Capture:
 )
 def test_the_first_frame_decides_whose_stamps_count(monkeypatch, ages_ms, stamped_by, expected_ms):
     """A stamp of the kernel's is moved to the middle of the exposure; none changes its clock midway."""
-    monkeypatch.setattr(opencv_camera, "_open", lambda *_: Capture(ages_ms))
+    monkeypatch.setattr(opencv_camera, "_open", lambda *_: capture)
+    capture = Capture(ages_ms)
     config = CameraConfig(kind="camera", exposure_us=8000, latency_ms=20.0)
     feed = opencv_camera.OpenCvFeed("eye", "0", config, Fraction(30), clock := WallClock())
     for age_ms in expected_ms:
@@ -178,6 +181,7 @@ def test_the_first_frame_decides_whose_stamps_count(monkeypatch, ages_ms, stampe
         else:
             assert (clock.now_ns() - taken[0]) / 1e6 == pytest.approx(age_ms, abs=3.0)
     assert feed.stamped_by == stamped_by
+    assert capture.given[cv2.CAP_PROP_BUFFERSIZE] > 1, "the camera fills one while the other is decoded"
 
 
 def test_the_camera_that_is_meant_is_the_one_named_or_the_only_one():
