@@ -6,6 +6,7 @@ where a point may be hidden, but never nearer than the surface that is measured 
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.doctor import doctor_constants as tuned
+from camera_node.pose.providers import PoseGapError
 from camera_node.settings import SourceConfig
-from camera_node.sources.base import pixels
+from camera_node.sources.base import Shot, Source, pixels
 from camera_node.sources.registry import open_sources
 from camera_node.sources.with_effects import camera_effects
 from freshfield.depth import DepthImage
@@ -61,14 +63,22 @@ def first_views(scenario: Scenario, config: SourceConfig, data: Path | None) -> 
         return []
     views = []
     for camera, source in open_sources(scenario, config, training, data, effects).items():
-        content = source.content(0)
-        shot = source.read(content)
-        measured = source.depth(content, shot)
+        first = _first_shot(source)
+        measured = None if first is None else source.depth(*first)
         source.release()
-        if measured is not None:
+        if first is not None and measured is not None:
+            shot = first[1]
             image = pixels(shot, config.codec)
             views.append(DepthView(camera, image, shot.intrinsics, shot.pose, measured))
     return views
+
+
+def _first_shot(source: Source) -> tuple[int, Shot] | None:
+    """Number and shot of the first capture that has a pose: a tracker may begin after its camera. None: none has."""
+    for content in map(source.content, range(source.contents or 1)):
+        with contextlib.suppress(PoseGapError):
+            return content, source.read(content)
+    return None
 
 
 def check(view: DepthView, others: Sequence[DepthView]) -> str:

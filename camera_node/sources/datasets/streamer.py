@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import PoseProvider
+from camera_node.pose.providers import PoseGapError, PoseProvider
 from camera_node.pose.trajectories import trajectory_poses
 from camera_node.settings import FPS_RANGE, PHOTO_FPS, RecordedConfig, VideoConfig, find_data
 from camera_node.sources.base import Shot, Source, assign_cameras, rate
@@ -102,6 +102,12 @@ def open_recorded(
     if isinstance(config, VideoConfig) and config.trajectory is not None:
         base = path if path.is_dir() else path.parent
         poses = trajectory_poses(scenario, config.trajectory, cameras, base)
+        for camera in poses:
+            if not any(_has_pose(poses[camera], image) for image in shown[camera]):
+                raise ScenarioError(
+                    f"{scenario.path}: source.trajectory.files.{camera}: no frame is within max_gap_ms of a pose: give "
+                    "the trajectory's time at the clip's first frame as start_s"
+                )
     sources: dict[str, Source] = {}
     for camera, fps in recorded.items():
         if camera not in poses and np.isnan(shown[camera][0].camera_to_world).any():
@@ -119,6 +125,18 @@ def open_recorded(
             playback = Playback(len(shots), playback.fps, playback.fps)
         sources[camera] = ImageSource(camera, shown[camera], shots, playback, config.codec, poses.get(camera))
     return sources
+
+
+def _has_pose(poses: PoseProvider, image: PosedImage) -> bool:
+    try:
+        poses.at(_time_ns(image))
+    except PoseGapError:
+        return False
+    return True
+
+
+def _time_ns(image: PosedImage) -> int:
+    return round((image.time_s or 0.0) * 1e9)
 
 
 def _shown(dataset: Dataset, name: str, held_out: bool) -> tuple[PosedImage, ...]:
@@ -218,7 +236,7 @@ class ImageSource(Source):
         if self._poses is None:
             pose, gap_ns = Pose.from_matrix(shown.camera_to_world), 0
         else:
-            pose, gap_ns = self._poses.at(round((shown.time_s or 0.0) * 1e9))
+            pose, gap_ns = self._poses.at(_time_ns(shown))
         image: NDArray[np.uint8] | bytes | None = self._as_stored(shown)
         if image is None or content not in self._whole:
             decoded = shown.read()  # once also of what is sent as stored: a file that is cut short is refused by name

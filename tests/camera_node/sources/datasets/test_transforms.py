@@ -10,6 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
+from camera_node.doctor.depth_check import first_views
+from camera_node.settings import source_config
 from camera_node.sources.calibration_file import load_calibration
 from camera_node.sources.datasets.lens import Lens, pinhole
 from camera_node.sources.datasets.photo import ImageOptions, Photo
@@ -348,6 +350,12 @@ def test_a_carried_camera_s_video_needs_its_field_of_view_and_a_trajectory(tmp_p
     assert hand.read(hand.content(0)).pose.translation_m == pytest.approx((0.5, 0, 0))
     refused(DatasetError, r"cam00.mp4: its lens is not known: give horizontal_fov_deg", found, **trajectory)
     refused(ScenarioError, r"trajectory.files.hand: missing", found, **fov)
+    (tmp_path / "videos" / "late.txt").write_text("1 0 0 0 0 0 0 1\n1.5 1 0 0 0 0 0 1")
+    late = {"kind": "video", **source, **fov, "trajectory": {"files": {"hand": "late.txt"}}}
+    begins_late = parse({"cameras": {"ids": ["hand"]}, "source": late}, Path("v.yaml"))
+    assert first_views(begins_late, source_config(begins_late), None) == [], "it has no depth, and nothing is wrong"
+    utc = {"files": {"hand": "late.txt"}, "start_s": -1.7e9}
+    refused(ScenarioError, "files.hand: no frame is within max_gap_ms of a pose: give", found, **fov, trajectory=utc)
 
 
 def restamped(video: Path, runs: list[tuple[int, float]]) -> None:
