@@ -49,14 +49,17 @@ def stop_event() -> threading.Event:
     return requested
 
 
-def stop_within_timeout(stop: Callable[[], None]) -> None:
-    """Call ``stop`` to stop an arm, but give up after ``STOPPING_S``: the library has no timeout."""
+def stop_within_timeout(stop: Callable[[], None], host: str) -> None:
+    """Call ``stop`` to stop the arm at ``host``, but give up after ``STOPPING_S``: the library has no timeout. Raises
+    ArmError then, unless another error is on its way already."""
     # The default action ends this process even if the library holds Python's lock.
     signal.setitimer(signal.ITIMER_REAL, 2 * STOPPING_S)
     thread = threading.Thread(target=stop, daemon=True)
     thread.start()
     thread.join(STOPPING_S)
     signal.setitimer(signal.ITIMER_REAL, 0)
+    if thread.is_alive() and sys.exception() is None:
+        raise ArmError(f"arm at {host}: it has not confirmed its stop within {STOPPING_S:g} s: does it stand still?")
 
 
 def joints_in_motion(stream: ArmStream) -> np.ndarray:

@@ -100,7 +100,7 @@ def _drive(stream: ArmStream, stops: list[np.ndarray], path: PathConfig, rounds:
                         raise ArmError(f"arm at {stream.host}: it refuses to move: {_reason(stream)}")
                     _wait_until_arrived(stream, control, joints, stop_requested)
         finally:
-            stop_within_timeout(stop)
+            stop_within_timeout(stop, stream.host)
     except ArmError as error:
         print(f"camera-node: {error}", file=sys.stderr, flush=True)
         os._exit(1)  # the library's destructor would wait for an arm that may be gone

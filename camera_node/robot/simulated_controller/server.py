@@ -144,8 +144,10 @@ class _Client:
 
     def send(self, values: dict) -> None:
         assert self._output is not None
-        # A client that does not read loses samples, so that it cannot fill this machine's memory.
-        if self._writer.transport.get_write_buffer_size() < tuned.MAX_WAITING_BYTES:
+        # A client that does not read loses samples, so that it cannot fill this machine's memory. To one that is gone
+        # asyncio would log each.
+        waiting = self._writer.transport.get_write_buffer_size()
+        if waiting < tuned.MAX_WAITING_BYTES and not self._writer.is_closing():
             self._reply(rtde.DATA, self._output.pack(values))
 
     def handle(self, kind: int, payload: bytes) -> dict | None:

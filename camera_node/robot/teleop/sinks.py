@@ -63,8 +63,8 @@ class ServoSink:
             raise ArmError(f"arm at {self._stream.host}: it refuses to move: see the pendant")
 
     def close(self) -> None:
-        """Stop the arm, and the program on its controller."""
-        stop_within_timeout(self._stop)
+        """Stop the arm, and the program on its controller. Raises ArmError."""
+        stop_within_timeout(self._stop, self._stream.host)
 
     def _stop(self) -> None:
         with contextlib.suppress(RuntimeError):

@@ -81,29 +81,28 @@ def _run_loop(operator: Teleoperator, stylus: Stylus, sink: Sink, seconds: float
     status, started_s = 0, time.monotonic()
     next_s, shown_s, late = started_s, started_s, 0
     try:
-        while not stop_requested.is_set() and not stylus.ended:
-            now_ns = clock.now_ns()
-            command = operator.tick(now_ns, stylus.poll(now_ns))
-            sink.send(operator.ticks * period_s, command)
-            now_s = time.monotonic()
-            if seconds is not None and now_s - started_s >= seconds:
-                break
-            if now_s - shown_s >= tuned.SHOW_S and sys.stderr.isatty():
-                shown_s = now_s
-                print(f"\r{_status_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
-            next_s += period_s
-            if next_s < now_s:
-                # Missed ticks are not made up for: the arm would move too fast.
-                next_s, late = now_s, late + 1
-            else:
-                stop_requested.wait(next_s - now_s)
-        _come_to_rest(operator, sink, period_s)
+        with contextlib.closing(sink):
+            while not stop_requested.is_set() and not stylus.ended:
+                now_ns = clock.now_ns()
+                command = operator.tick(now_ns, stylus.poll(now_ns))
+                sink.send(operator.ticks * period_s, command)
+                now_s = time.monotonic()
+                if seconds is not None and now_s - started_s >= seconds:
+                    break
+                if now_s - shown_s >= tuned.SHOW_S and sys.stderr.isatty():
+                    shown_s = now_s
+                    print(f"\r{_status_line(operator)}\x1b[K", end="", file=sys.stderr, flush=True)
+                next_s += period_s
+                if next_s < now_s:
+                    # Missed ticks are not made up for: the arm would move too fast.
+                    next_s, late = now_s, late + 1
+                else:
+                    stop_requested.wait(next_s - now_s)
+            _come_to_rest(operator, sink, period_s)
     except (ArmError, OSError) as error:
         operator.stop()
         print(f"camera-node: {error}", file=sys.stderr)
         status = 1
-    finally:
-        sink.close()
     print(f"\n{_status_line(operator)}; {late} of {operator.ticks} ticks late")
     return status
 

@@ -89,6 +89,13 @@ def test_an_arm_that_has_been_stopped_is_sent_nothing_more(monkeypatch):
     stream.trouble = "arm at 10.0.0.1: safety: protective stop"
     refused(ArmError, "protective stop: stopped", sink.send, 0.01, still)
     assert control.servoJ.call_count == 2
+    monkeypatch.setattr("camera_node.robot.arm.control.STOPPING_S", 0.02)
+    monkeypatch.setattr("signal.setitimer", lambda *_: None)  # the test's own timeout
+    confirmed = threading.Event()
+    control.stopScript.side_effect = confirmed.wait
+    refused(ArmError, "has not confirmed its stop", sink.close)
+    confirmed.set()
+    sink.close()
 
 
 def test_the_operator_ends_it_and_the_arm_comes_to_rest(capsys):
@@ -106,6 +113,8 @@ def test_the_operator_ends_it_and_the_arm_comes_to_rest(capsys):
     assert np.abs(sent[60].speeds).max() > 0.0 and not sent[-1].speeds.any() and 61 < len(sent) < 200
     sink.close.assert_called_once()
     assert "clutch pressed 1 times" in capsys.readouterr().out
+    stylus.ended, sink.close.side_effect = True, ArmError("it has not confirmed its stop")
+    assert teleop_command._run_loop(Teleoperator(UR3E, TeleopConfig(), HOME), stylus, sink, None) == 1
 
 
 def test_wrong_settings_are_refused_by_name(tmp_path, capsys):
