@@ -64,12 +64,23 @@ def write_video(
             raise ExportError(f"{file}: no image to write")
         if video is not None:
             video.release()
+            _check_complete(file, part, count)
         part.replace(file)
     finally:
         if video is not None:
             video.release()
         part.unlink(missing_ok=True)
     return count, *size
+
+
+def _check_complete(file: Path, part: Path, count: int) -> None:
+    """ExportError unless the video ``part`` has ``count`` images: OpenCV does not tell that it could not write some."""
+    written = cv2.VideoCapture(str(part))
+    try:
+        if not written.isOpened() or int(written.get(cv2.CAP_PROP_FRAME_COUNT)) != count:
+            raise ExportError(f"{file}: cannot be written whole: is the disk full?")
+    finally:
+        written.release()
 
 
 def checked_file(file: Path) -> Path:

@@ -9,10 +9,10 @@ import pytest
 
 from edge_server.cli import main as edge_server
 from edge_server.experiments.scenes.recorded import load_recorded
-from edge_server.export import file_names, ply
+from edge_server.export import ExportError, file_names, ply
 from edge_server.export.colmap import Cloud, write_model
 from edge_server.export.exporter import write_mesh
-from edge_server.export.images_and_video import write_images
+from edge_server.export.images_and_video import write_images, write_video
 from edge_server.export.point_cloud import sparse_points
 from edge_server.export.splats import Y0, splat_table, write_splats
 from edge_server.export.transforms import write_transforms
@@ -25,7 +25,8 @@ from edge_server.page.splats.published import Publisher
 from freshfield.geometry import se3_inverse
 from tests.edge_server.page.splats.gaussians import BOX, NEWEST_S, ORIGIN_NS, snapshot
 from tests.edge_server.surface.ball import DISTORTED_LENS, LENS, ball_maps
-from tests.support import refusal
+from tests.freshfield.test_ledger import no_file_longer_than
+from tests.support import refusal, refused
 
 RNG = np.random.default_rng(5)
 
@@ -211,6 +212,15 @@ def test_points_know_who_sees_them():
         front = found.points @ m.camera_to_world[:3, 3] > 0
         assert front[found.seen[:, k]].all()
     assert (found.seen.sum(axis=1) >= 2).mean() > 0.8
+
+
+def test_a_video_that_a_full_disk_cuts_is_refused_and_the_old_one_stays(tmp_path):
+    file, pictures = tmp_path / "a.mp4", RNG.integers(0, 255, (30, 64, 96, 3), dtype=np.uint8)
+    assert write_video(file, pictures[:3]) == (3, 96, 64)
+    before = file.read_bytes()
+    with no_file_longer_than(20_000):
+        refused(ExportError, "a.mp4: cannot be written whole", write_video, file, pictures)
+    assert file.read_bytes() == before and list(tmp_path.iterdir()) == [file]
 
 
 def test_pictures_keep_their_own_names_and_these_are_safe_and_different():
