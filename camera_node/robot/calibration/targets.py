@@ -149,6 +149,9 @@ class Charuco(Target):
         self._marker, self._dictionary = _meters(marker) / self.square_m, dictionary.upper()
         if not self._marker < 1.0:
             raise ValueError("the markers must be smaller than the squares")
+        needed, held = across * down // 2, len(_dictionary(self._dictionary).bytesList)
+        if needed > held:
+            raise ValueError(f"it has {needed} markers, {self._dictionary} {held}: add a larger one, such as :4X4_1000")
         self._detectors = _charuco_detectors(across, down, self._marker, self._dictionary)
         self._board = self._detectors[0].getBoard()
         self._places = self.square_m * np.asarray(self._board.getChessboardCorners(), dtype=np.float64)

@@ -298,6 +298,7 @@ def test_specs_that_are_none_say_what_is_one():
         ("circles:3x4", "no kind 'circles'"),
         ("chessboard:9x6:23.6", "needs a unit"),
         ("chessboard:8x6:20mm", "odd and the other even"),
+        ("charuco:12x9:30mm:22mm", "it has 54 markers, 4X4_50 50: add a larger one"),
     ):
         refused(CalibrationError, rf"charuco:7x5:30mm:22mm .*{why}", parse_target, spec)
 
