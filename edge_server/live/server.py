@@ -30,13 +30,13 @@ from edge_server.live.field_updater import open_updater
 from edge_server.live.grpc_services import GrpcThread
 from edge_server.live.ingest import Ingest, percentile
 from edge_server.live.loop import UpdateLoop
-from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import Journal
 from edge_server.live.scoring.scoring_thread import ScoringThread
 from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, Publication, Snapshot
 from edge_server.machine import run_facts
 from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
+from edge_server.scheduler.learned.decision_record import DecisionWriter
 from edge_server.settings import EdgeConfig, cameras_move, described, embedding_for, read_config
 from freshfield.clock import WallClock
 from freshfield.files import read_status, write_json
@@ -163,7 +163,7 @@ class EdgeServer:
             earlier.last_frames,
             scenario.codec,
         )
-        self._decision_log = DecisionLog(options.out, embedding_for(config, policy))
+        self._decisions = DecisionWriter(options.out, embedding_for(config, policy))
         controls = Controls(policy.name, policy.value)
         self.loop = UpdateLoop(
             self.updater,
@@ -288,7 +288,7 @@ class EdgeServer:
             counts.refused[camera] = counts.refused.get(camera, 0) + 1
         self.state.publish(publication, renderer)
         self.journal.published(publication)
-        self._decision_log.record(self.updater.policy, publication.number)
+        self._decisions.record(self.updater.policy, publication.number)
         if self.recorder is not None:
             self.recorder.published(publication)
         self.scoring.published(publication, renderer, views)
@@ -392,7 +392,7 @@ class EdgeServer:
             "streams_ended": self.ingest.streams.ended,
             "two_nodes": dict(self.ingest.admission.doubled),
             "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
-            "decisions_lost": self._decision_log.lost,
+            "decisions_lost": self._decisions.lost,
             "last_frames": self.ingest.admission.last_frames(),
             "stale_on_arrival": self.buffer.stale_on_arrival,
             "check_ms": {f"p{p}": percentile(self.ingest.check_ms, p) for p in (50, 99)},

@@ -30,11 +30,11 @@ from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SHOWN, Score, Scorer
-from edge_server.live.output.decision_log import DecisionLog
 from edge_server.live.output.journal import shown_line
 from edge_server.live.state import Publication
 from edge_server.machine import run_facts, versions
 from edge_server.scheduler import parse_policy, short_name
+from edge_server.scheduler.learned.decision_record import DecisionWriter
 from edge_server.settings import (
     ComputeConfig,
     EdgeConfig,
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _simulate(args: argparse.Namespace) -> None:
     folders = folders_of(args)
-    decisions: DecisionLog | None = None
+    decisions: DecisionWriter | None = None
     chosen: list[str] = []
 
     def published(publication: Publication) -> None:
@@ -90,7 +90,7 @@ def _simulate(args: argparse.Namespace) -> None:
         for earlier in (args.out / "decisions").glob("*.npz"):  # of another run in this folder: explain would take them
             if earlier.stem.isdigit() or earlier.stem.startswith("policy-"):
                 earlier.unlink()
-        decisions = DecisionLog(args.out, embedding_for(config, deployment.updates.policy))
+        decisions = DecisionWriter(args.out, embedding_for(config, deployment.updates.policy))
     watched = None
     if scenario.held_out_every:
         kept = build_cameras(scenario, source_config(scenario), scenario.held_out, folders.data)

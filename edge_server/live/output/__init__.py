@@ -1,1 +1,1 @@
-"""What a running edge writes and serves: run files, recordings, decisions, metrics."""
+"""What a running edge writes and serves: run files, recordings, metrics."""

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,13 @@ from edge_server.fields import checkpoint
 from edge_server.scheduler.learned import learning_constants as tuned
 from edge_server.scheduler.learned.actor import Actor, Decision
 from edge_server.scheduler.learned.state import State
+from edge_server.scheduler.policy import Policy
 from freshfield import payload
+from freshfield.settings import as_mapping
 from freshfield.untrusted import stored_bytes
+
+if TYPE_CHECKING:  # imported at run time only where frames are embedded
+    from edge_server.embed.settings import EmbeddingConfig
 
 log = logging.getLogger(__name__)
 
@@ -36,12 +40,18 @@ class DecisionWriter:
     embedding: settings of the embedder, to embed the frames again; None: nothing was embedded.
     """
 
-    def __init__(self, out: Path, embedding: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, out: Path, embedding: EmbeddingConfig | None = None) -> None:
         self._folder = out / FOLDER
-        self._embedding = dict(embedding) if embedding else None
+        self._embedding = None if embedding is None else as_mapping(embedding)
         # Decision's file, policy's file, bytes written for it; those of an earlier process first.
         self._kept = deque((p, "", p.stat().st_size) for p in _numbered(self._folder))
         self.lost = 0
+
+    def record(self, policy: Policy, number: int) -> None:
+        """Write the decision of update ``number``, if ``policy`` is learned and took it."""
+        decision = policy.last_decision
+        if decision is not None and decision.number == number:
+            self.write(decision)
 
     def write(self, decision: Decision) -> None:
         """Write a decision and drop the oldest ones that no longer fit."""

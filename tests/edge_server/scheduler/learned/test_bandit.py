@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from edge_server.embed.settings import EmbeddingConfig
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.field_updater import FieldUpdater
 from edge_server.report.explain_command import main
@@ -121,7 +122,7 @@ def names(folder, pattern="*.npz"):
 
 def test_a_decision_comes_back_as_it_was(tmp_path):
     given = a_decision(7)
-    DecisionWriter(tmp_path, {"model": "default", "dim": 3}).write(given)
+    DecisionWriter(tmp_path, EmbeddingConfig(dim=3)).write(given)
     found = read_decision(tmp_path, 7)
     back = found.decision
     assert (back.number, back.now_ns, back.logp) == (given.number, given.now_ns, given.logp)
@@ -198,7 +199,7 @@ def test_regions_are_found_with_what_embedded_the_frames(tmp_path, capsys):
     pytest.importorskip("onnxruntime", reason="the extra embed is not installed")
     from tests.edge_server.embed.graphs import detector
 
-    DecisionWriter(tmp_path, {"model": str(detector(tmp_path / "d.onnx")), "dim": 3}).write(a_decision(2))
+    DecisionWriter(tmp_path, EmbeddingConfig(str(detector(tmp_path / "d.onnx")), 3)).write(a_decision(2))
     assert main([str(tmp_path), "--decision", "2", "--camera", "cam01"]) == 0
     said = re.search(r"the picture of cam01 most by the region in .* of 8 x 8: (\S+)", capsys.readouterr().out)
     assert abs(float(said[1])) > 0
