@@ -13,7 +13,7 @@ from markupsafe import Markup
 
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView, Publication
-from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, RGB, age_color, css, scale_color
+from edge_server.page.colors import HELD_OUT, MEASURED, PRESENT, age_color, css, scale_color
 from edge_server.page.page_constants import FRESH_MS, NAMED_CAMERAS, STALE_MS
 from edge_server.run_records import Frontier
 from freshfield.scenario import NOTHING_HELD_OUT
@@ -42,9 +42,9 @@ class Summary:
     age_parts_ms: Mapping[str, float]
 
 
-def html(macro: str, *text: str) -> str:
-    """A part of the panel that takes one text or none, by the name of its macro in ``panel.html.j2``."""
-    return str(getattr(_panel, macro)(*text))
+def html(macro: str, *values: Any) -> str:
+    """A part of the panel that needs nothing but the template, by the name of its macro in ``panel.html.j2``."""
+    return str(getattr(_panel, macro)(*values))
 
 
 def status(s: Summary) -> str:
@@ -81,16 +81,6 @@ def frontier(found: Frontier, present: tuple[float, float, float | None] | None)
     return str(_panel.frontier(whole, moving, [at(ms, db).split(",") for ms, db in now], ends, found.about))
 
 
-def table(cameras: Sequence[CameraView], selected: Sequence[str] = ()) -> str:
-    """One row for each camera: age, frames delivered and rejected. Cameras of the last update are ticked."""
-    return str(_panel.table(cameras, selected))
-
-
-def coverage(plan: str, words: str) -> str:
-    """What fixed cameras see. plan: SVG of ``freshfield.coverage.plan_svg``."""
-    return str(_panel.coverage(plan, words))
-
-
 def decision_words(last: Publication, cameras: Sequence[CameraView], policy: str) -> str:
     """What the newest update used, and what it left out, in words.
 
@@ -121,11 +111,6 @@ def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out
     """The caption above the pair of images. held_out: the camera is."""
     truth = "truth at the present" if held_out else NOTHING_HELD_OUT
     return str(_panel.comparison_caption(camera, psnr_db, update, truth))
-
-
-def chart_caption(title: str, lines: Sequence[tuple[str, RGB]], remark: str = "") -> str:
-    """A chart's title on the left; on the right ``remark``, or the names of its lines in their colors."""
-    return str(_panel.chart_caption(title, lines, remark))
 
 
 def channel_line(channel: dict[str, Any]) -> str:

@@ -94,7 +94,7 @@ class Panel:
         if last is not None:
             self._decision.content = markup.decision_words(last, cameras, self._state.controls.policy)
             self._decision.visible = True
-        self._table.content = markup.table(cameras, last.selected if last else ())
+        self._table.content = html("table", cameras, last.selected if last else ())
         self._waiting.visible = last is None
         if channel is not None:
             self._channel.content = markup.channel_line(channel)
@@ -124,7 +124,7 @@ class Panel:
         self._reckoned_for, self._reckoned_with_depth = known, depth
         found = coverage.reckon(list(known.values()))
         words = f"{found.words}. {coverage.reached(len(cameras), depth)}"
-        self._coverage.content = markup.coverage(coverage.plan_svg(known, found), words)
+        self._coverage.content = html("coverage", coverage.plan_svg(known, found), words)
 
     def _show_comparison(self, comparison: Comparison, publications: list[Publication], held_out: bool) -> None:
         self._compared_update = comparison.number

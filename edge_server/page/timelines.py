@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from edge_server.fidelity.scorer import fidelity_title
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.colors import FRESH, HELD_OUT, MIDDLE, RGB, STALE, UNKNOWN, css
-from edge_server.page.markup import chart_caption
+from edge_server.page.markup import html
 from edge_server.page.page_constants import CHART_HEIGHT_PX, CHART_LINE_PX, CHART_POINTS, CHART_SAMPLES, WINDOW_S
 
 STATE_WORDS = {"low": "good", "high": "bad"}
@@ -130,7 +130,7 @@ class _Chart:
                 self._chart = self._make([self._lines[i] for i in shown], data)
         else:
             self._chart.data = data
-        self._caption.content = chart_caption(self.title, [self._lines[i] for i in shown], remark)
+        self._caption.content = html("chart_caption", self.title, [self._lines[i] for i in shown], remark)
         self._caption.visible = True
 
     def _make(self, lines: Sequence[tuple[str, RGB]], data: tuple[NDArray, ...]) -> Any:

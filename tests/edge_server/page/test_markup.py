@@ -62,10 +62,10 @@ def test_what_comes_from_outside_is_escaped():
     camera = CameraView(evil, False, None, None, 0, 0)
     pages = [
         markup.status(summary(scenario=evil, field=evil, doing=evil, scored_on=evil, condition="live")),
-        markup.table([camera]),
+        markup.html("table", [camera]),
         markup.comparison_caption(evil, None, 0, True),
-        markup.chart_caption(evil, [(evil, (0, 0, 0))]),
-        markup.chart_caption("", [], evil),
+        markup.html("chart_caption", evil, [(evil, (0, 0, 0))]),
+        markup.html("chart_caption", "", [], evil),
         markup.html("note", evil),
         markup.channel_line({"preset": evil, "counts": 3, "drawn_delay_ms": {"mean": None}}),
     ]
@@ -80,7 +80,7 @@ def test_the_table_marks_age_truth_use_and_refusals():
         CameraView("cam01", False, None, 9000.0, 7, 3),
         CameraView("cam02", False, None, None, 0, 0),
     ]
-    rows = markup.table(cameras, selected=("cam01",)).split("<tr>")[2:]
+    rows = markup.html("table", cameras, ["cam01"]).split("<tr>")[2:]
     assert "truth" in rows[0] and css(HELD_OUT) in rows[0]
     assert "9000 ms" in rows[1] and "&#10003;" in rows[1] and css(STALE) in rows[1] and ">3<" in rows[1]
     assert "no frame yet" in rows[2] and "&#10003;" not in rows[2]
