@@ -140,6 +140,7 @@ class EdgeState:
     events: (seconds since the run began, what happened), for the report; ``note`` adds one. Those of an earlier process
         have negative seconds: before it ended.
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
+    renderer, comparison: the newest ones; None before the first.
     """
 
     scenario: str
@@ -163,8 +164,8 @@ class EdgeState:
     events: deque[tuple[float, str]] = field(default_factory=lambda: deque(maxlen=tuned.MOST_EVENTS))
     _publications: deque[Publication] = field(default_factory=lambda: deque(maxlen=tuned.KEPT_PUBLICATIONS))
     _shown: deque[Score] = field(default_factory=lambda: deque(maxlen=tuned.SHOWN_OF))
-    _renderer: Snapshot | None = None
-    _comparison: Comparison | None = None
+    renderer: Snapshot | None = None
+    comparison: Comparison | None = None
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def now_s(self) -> float:
@@ -179,7 +180,7 @@ class EdgeState:
         """Add a publication."""
         with self._lock:
             self._publications.append(publication)
-            self._renderer = renderer
+            self.renderer = renderer
             self.started = True
 
     def scored(self, publication: Publication, comparison: Comparison | None) -> None:
@@ -190,7 +191,7 @@ class EdgeState:
                     self._publications[i] = publication
                     break
             if comparison is not None:
-                self._comparison = comparison
+                self.comparison = comparison
 
     def add_shown(self, score: Score) -> None:
         """Add a score of what was shown at a random instant."""
@@ -221,13 +222,3 @@ class EdgeState:
         with self._lock:
             every = reversed(self._publications)
             return next((p for p in every if not scored or p.psnr_db is not None), None)
-
-    @property
-    def renderer(self) -> Snapshot | None:
-        with self._lock:
-            return self._renderer
-
-    @property
-    def comparison(self) -> Comparison | None:
-        with self._lock:
-            return self._comparison
