@@ -25,7 +25,6 @@ from freshfield.settings import ScenarioError, Settings, about, read_settings, w
 from freshfield.untrusted import read_json, read_text
 
 if TYPE_CHECKING:
-    from edge_server.embed.embedder import Embedder
     from edge_server.embed.settings import EmbeddingConfig
 
 
@@ -166,15 +165,6 @@ def embedding_for(config: EdgeConfig, policy: Policy) -> EmbeddingConfig | None:
     from edge_server.embed.settings import EmbeddingConfig
 
     return EmbeddingConfig()
-
-
-def open_embedder(embedding: EmbeddingConfig | None) -> Embedder | None:
-    """The embedder; None without a config. ValueError where its model cannot be used."""
-    if embedding is None:
-        return None
-    from edge_server.embed import make_embedder
-
-    return make_embedder(embedding)
 
 
 def read_config(scenario: Scenario, moving: bool | None = None) -> EdgeConfig:

@@ -21,7 +21,7 @@ from edge_server.live.camera_motion import CameraMotion
 from edge_server.live.state import Publication
 from edge_server.live.view_decoder import ViewDecoder
 from edge_server.scheduler import STATE_PARTS, Epoch, Policy, SelectionWindow
-from edge_server.settings import EdgeConfig, embedding_for, open_embedder
+from edge_server.settings import EdgeConfig, embedding_for
 from freshfield.frame import Frame
 from freshfield.plugins import short_name
 from freshfield.scenario import Scenario, ScenarioError
@@ -135,11 +135,9 @@ class FieldUpdater:
                 f"is {self.embedder.name} of {self.embedder.dim}"
             )
 
-    def epoch(self, now_ns: int) -> Epoch:
-        """What the policy may look at, at ``now_ns``."""
-        return self._epoch(self.buffer.newest(), now_ns)
-
     def _epoch(self, newest: Mapping[str, Frame], now_ns: int) -> Epoch:
+        """What the policy may look at, at ``now_ns``."""
+
         def state(parts: Sequence[str] = STATE_PARTS) -> State:
             from edge_server.scheduler.learned.observation import observe
 
@@ -155,7 +153,7 @@ class FieldUpdater:
     def plan(self, now_ns: int) -> SelectionWindow:
         """The first half of a decision: how long to wait for frames."""
         try:
-            return self.policy.plan(self.epoch(now_ns))
+            return self.policy.plan(self._epoch(self.buffer.newest(), now_ns))
         except Exception as error:
             self._policy_failed(error)
             self._unplanned = True
@@ -326,7 +324,11 @@ def open_updater(
     try:
         if config.depth_network is not None:
             _use_depth_network(field, scenario.path.parent / config.depth_network)
-        embedder = embedder or open_embedder(embedding_for(config, policy))
+        embedding = embedding_for(config, policy)
+        if embedder is None and embedding is not None:
+            from edge_server.embed import make_embedder
+
+            embedder = make_embedder(embedding)
         buffer = FrameBuffer(scenario.training)
         on_arrivals = config.updates == "arrivals"
         return FieldUpdater(buffer, policy, field, start_ns, embedder, keyframes, foreground, on_arrivals)

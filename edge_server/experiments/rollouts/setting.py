@@ -17,7 +17,7 @@ from edge_server.experiments import experiment_constants as tuned
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.scheduler.learned.rewards import Reward, make_reward
 from edge_server.scheduler.learned.state import StateLayout
-from edge_server.settings import ComputeConfig, open_embedder, read_config
+from edge_server.settings import ComputeConfig, read_config
 from freshfield.scenario import Scenario, ScenarioError
 
 # Training, model selection and testing use disjoint seeds.
@@ -158,8 +158,8 @@ def layout_of(setting: Setting, parts: tuple[str, ...]) -> StateLayout:
     Raises ValueError if no embedder is available."""
     if "semantics" not in parts:
         return StateLayout(parts)
+    from edge_server.embed import make_embedder
     from edge_server.embed.settings import EmbeddingConfig
 
-    embedder = open_embedder(read_config(setting.scenario).embedding or EmbeddingConfig())
-    assert embedder is not None
+    embedder = make_embedder(read_config(setting.scenario).embedding or EmbeddingConfig())
     return StateLayout(parts, embedder.dim, embedding=embedder.name)
