@@ -32,7 +32,7 @@ from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.live.buffer import FrameBuffer
 from edge_server.live.view_decoder import ViewDecoder
-from edge_server.scheduler.learned.observation import FrameEmbeddings, observe
+from edge_server.scheduler.learned.observation import observe
 from edge_server.scheduler.learned.state import State
 from edge_server.settings import read_config
 from freshfield.frame import Frame
@@ -40,6 +40,7 @@ from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
     from edge_server.embed import Embedder
+    from edge_server.embed.cache import EmbeddingCache
 
 Image = Callable[[str, float], NDArray[np.uint8]]
 SCORES = ("psnr_db", "psnr_moving_db", "ssim", "lpips")
@@ -192,7 +193,7 @@ class EpisodeFactory:
         scenario = self.setting.scenario if seed is None else self.scenario(seed)
         return open_stage(scenario, self._scorer, self.folders, self._period_ns)
 
-    def embeddings(self) -> FrameEmbeddings | None:
+    def embeddings(self) -> EmbeddingCache | None:
         """A new cache for one episode: frame numbers repeat across episodes with different images."""
         if self.embedder is None:
             return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,30 +13,25 @@ from edge_server.scheduler.policy import STATE_PARTS
 from freshfield.frame import Frame
 from freshfield.geometry import quaternion_normalize
 
+if TYPE_CHECKING:
+    from edge_server.embed.cache import EmbeddingCache
+
 # A rig of one camera, or of several at one point, has no size to scale by.
 _MIN_RIG_RADIUS_M = 1e-6
-
-
-class FrameEmbeddings(Protocol):
-    """Computes z = F_e(frame) (6.31) and caches it per frame (edge_server.embed)."""
-
-    def of(self, items: Sequence[Frame]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Embeddings (n, d), and a mask (n,) of the frames that have one."""
-        ...
 
 
 def observe(
     cameras: Sequence[str],
     newest: Mapping[str, Frame],
     now_ns: int,
-    embeddings: FrameEmbeddings | None = None,
+    embeddings: EmbeddingCache | None = None,
     parts: Sequence[str] = STATE_PARTS,
     keep_frames: bool = False,
 ) -> State:
     """The state of ``cameras`` at ``now_ns``.
 
-    newest: the newest frame of each camera that has reported. parts: those to compute; otherwise poses are
-    zero and embeddings None. keep_frames: keep the embedded frames in the state.
+    newest: the newest frame of each camera that has reported. embeddings: computes z = F_e(frame) (6.31). parts: those
+    to compute; otherwise poses are zero and embeddings None. keep_frames: keep the embedded frames in the state.
     """
     n = len(cameras)
     rows = [i for i, camera in enumerate(cameras) if camera in newest]
