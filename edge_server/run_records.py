@@ -280,10 +280,9 @@ class FrontierPoint(Struct, frozen=True):
 class Frontier(Struct):
     """frontier.json: what accuracy costs in time, as measured before the run for its field.
 
-    points: those measured at the speed nearest to ``speed_m_per_s``, the speed of the run's scene.
+    points: those measured at the speed nearest to that of the run's scene.
     about: which file they come from, or why there are none.
     """
 
     points: list[FrontierPoint]
     about: str
-    speed_m_per_s: Number = 1.0

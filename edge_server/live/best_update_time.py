@@ -94,8 +94,8 @@ def open_frontier(scenario: Scenario, config: EdgeConfig) -> Frontier:
     except ValueError as error:
         if path is not None:
             raise
-        return Frontier([], str(error), speed)
+        return Frontier([], str(error))
     points = _at_nearest_speed(points, speed)
     file = config.frontier or "the shipped frontier.json, of room"
     first = points[0]
-    return Frontier(points, f"{file}, at {first.speed_m_per_s:g} m/s, as {first.measured}", speed)
+    return Frontier(points, f"{file}, at {first.speed_m_per_s:g} m/s, as {first.measured}")
