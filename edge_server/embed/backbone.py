@@ -76,7 +76,8 @@ def load_backbone(path: Path) -> Backbone:
     image = _image_input(model, path)
     at = _find_end(model, path)
     cut = _cut(model, image.name, at, path)
-    batch, (height, width) = _shape_of(cut, meta, path)
+    batch, _, height, width = (d.dim_value for d in cut.graph.input[0].type.tensor_type.shape.dim)
+    height, width = input_size(height, width, meta, path)
     channels = _check_shapes(cut, batch or 1, height, width, path)
     return Backbone(
         name=path.stem,
@@ -85,7 +86,7 @@ def load_backbone(path: Path) -> Backbone:
         dtype=_TYPES[image.type.tensor_type.elem_type],
         tap=at,
         channels=channels,
-        batch=batch,
+        batch=batch or None,
         height=height,
         width=width,
         digest=hashlib.sha256(data).hexdigest()[:8],
@@ -209,25 +210,19 @@ def _cut(model: onnx.ModelProto, image: str, tap: str, path: Path) -> onnx.Model
     return cut
 
 
-def _shape_of(cut: onnx.ModelProto, meta: dict[str, str], path: Path) -> tuple[int | None, tuple[int, int]]:
-    """(fixed batch or None, (height, width)) of the model's input."""
-    batch, _, height, width = (d.dim_value for d in cut.graph.input[0].type.tensor_type.shape.dim)
+def input_size(height: int, width: int, meta: dict[str, str], path: Path) -> tuple[int, int]:
+    """(height, width) of a model's images: where its input leaves them open (0), those in the exporter's metadata, such
+    as ``[640, 640]``, else USUAL_SIDE. EmbeddingError for a size that no image has."""
     if not (height and width):
-        height, width = exported_size(meta)
+        try:
+            height, width = (int(side) for side in ast.literal_eval(meta["imgsz"]))
+        except (KeyError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
+            height = width = USUAL_SIDE
     if not (1 <= height <= tuned.MAX_MODEL_SIDE_PX and 1 <= width <= tuned.MAX_MODEL_SIDE_PX):
         raise EmbeddingError(
             f"{path}: images of {width} x {height} are not within 1 to {tuned.MAX_MODEL_SIDE_PX} a side"
         )
-    return batch or None, (height, width)
-
-
-def exported_size(meta: dict[str, str]) -> tuple[int, int]:
-    """(height, width) in the exporter's metadata, such as ``[640, 640]``, else USUAL_SIDE."""
-    try:
-        height, width = (int(side) for side in ast.literal_eval(meta["imgsz"]))
-        return height, width
-    except (KeyError, ValueError, TypeError, SyntaxError, MemoryError, RecursionError):
-        return USUAL_SIDE, USUAL_SIDE
+    return height, width
 
 
 def _check_shapes(cut: onnx.ModelProto, batch: int, height: int, width: int, path: Path) -> int:

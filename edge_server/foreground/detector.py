@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edge_server import edge_constants as tuned
 from edge_server.embed import EmbeddingError
-from edge_server.embed.backbone import exported_size
+from edge_server.embed.backbone import input_size
 from edge_server.embed.embedder import INPUT_TYPES, open_model, reason_of
 from edge_server.embed.letterbox import blob, checked, placed
 from edge_server.foreground.settings import MODELS, SHIPPED
@@ -55,7 +55,8 @@ class Detector:
             raise EmbeddingError(f"{file}: expected a model of images (n, 3, height, width)")
         self._input, self._dtype = image.name, INPUT_TYPES[image.type]
         meta = self._session.get_modelmeta().custom_metadata_map
-        self.height, self.width = _size(image.shape, meta, file)
+        height, width = (side if isinstance(side, int) else 0 for side in image.shape[2:])
+        self.height, self.width = input_size(height, width, meta, file)
         self.kinds = _kinds(meta)
         outputs = sorted(self._session.get_outputs(), key=lambda output: len(output.shape))
         task = meta.get("task", "segment")
@@ -180,18 +181,6 @@ def _end_to_end(meta: dict[str, str]) -> bool | None:
     if not any(each is not None for each in says):
         return None
     return any(str(each).lower() == "true" for each in says)
-
-
-def _size(shape: list[Any], meta: dict[str, str], file: Path) -> tuple[int, int]:
-    """(height, width) of the input: fixed by the model, else those of ``exported_size``."""
-    height, width = (side if isinstance(side, int) else 0 for side in shape[2:])
-    if not (height and width):
-        height, width = exported_size(meta)
-    if not (1 <= height <= tuned.MAX_MODEL_SIDE_PX and 1 <= width <= tuned.MAX_MODEL_SIDE_PX):
-        raise EmbeddingError(
-            f"{file}: images of {width} x {height} are not within 1 to {tuned.MAX_MODEL_SIDE_PX} a side"
-        )
-    return height, width
 
 
 def _kinds(meta: dict[str, str]) -> dict[int, str]:
