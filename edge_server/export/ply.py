@@ -14,13 +14,8 @@ _TYPES = {"f4": "float", "f8": "double", "u1": "uchar", "i4": "int"}
 
 def write_points(path: Path, points: NDArray[np.float32], color: NDArray[np.uint8]) -> None:
     """Write points (N, 3) in meters with color (N, 3)."""
-    places, colors = [(n, "<f4") for n in "xyz"], [(n, "u1") for n in ("red", "green", "blue")]
-    table = np.zeros(len(points), dtype=[*places, *colors])
-    for k, name in enumerate("xyz"):
-        table[name] = points[:, k]
-    for k, name in enumerate(("red", "green", "blue")):
-        table[name] = color[:, k]
-    write_table(path, table)
+    kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+    write_table(path, np.rec.fromarrays([*points.T, *color.T], dtype=kinds))
 
 
 def write_table(path: Path, table: NDArray[np.void]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,25 +24,17 @@ GEOMETRY = (
 )
 
 
-@dataclass(frozen=True)
 class StepFeatures:
     """Features of taking each candidate next."""
 
-    candidates: Candidates
-    _alike: Array = field(init=False, repr=False)
-    _way: Array = field(init=False, repr=False)
-    _place: Array = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        d = self.candidates.directions
+    def __init__(self, candidates: Candidates) -> None:
+        self.candidates, d = candidates, candidates.directions
         angle = np.arccos(np.clip(d @ d.T, -1.0, 1.0))
-        alike = np.stack([np.exp(-((angle / width) ** 2)) for width in LIKENESS_RAD])
-        way = np.stack([travel_m(self.candidates, k) for k in range(len(d))])
-        at = self.candidates.poses[:, :3, 3] - self.candidates.target
+        self._alike = np.stack([np.exp(-((angle / width) ** 2)) for width in LIKENESS_RAD])
+        self._way = np.stack([travel_m(candidates, k) for k in range(len(d))])
+        at = candidates.poses[:, :3, 3] - candidates.target
         place = at / max(float(np.linalg.norm(at, axis=1).mean()), 1e-12)
-        place = np.column_stack([place, place[:, 0] ** 2, place[:, 2] ** 2])
-        for name, value in (("_alike", alike), ("_way", way), ("_place", place)):
-            object.__setattr__(self, name, value)
+        self._place = np.column_stack([place, place[:, 0] ** 2, place[:, 2] ** 2])
 
     def actions(self, order: Sequence[int]) -> Array:
         """(N, F) features, named by GEOMETRY, of each candidate as the next view after those of ``order``:

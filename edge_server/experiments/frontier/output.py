@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from edge_server.experiments.common.tables import markdown_table, number
-from edge_server.experiments.frontier.update_time import best, field_label
+from edge_server.experiments.frontier.update_time import field_label
 from edge_server.live.best_update_time import best_point, points_of
 from edge_server.matplotlib_figures import CYCLE, INK, figure
 from edge_server.settings import LEAST_UPDATE_MS
@@ -103,8 +103,8 @@ def draw_updates(path: Path, rows: Sequence[Row]) -> None:
                     x = [r["update_s"] for r in group]
                     shown = [r[f"shown_{key}"] for r in group]
                     ax.plot(x, shown, marker=".", linewidth=1.2, label=field_label(*who), **look)
-                top = best(here, f"shown_{key}")
-                if top is not None:
+                if here:
+                    top = max(here, key=lambda row: row[f"shown_{key}"])
                     _encircle(ax, [top["update_s"]], [top[f"shown_{key}"]], "best")
         for ax, speed in zip(axes[0], speeds):
             ax.set_title(f"{speed:g} m/s")

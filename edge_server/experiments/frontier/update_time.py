@@ -180,12 +180,6 @@ def steps_for(update_s: float, compute: ComputeConfig) -> int:
     return max(1, round((update_s * 1e3 - compute.ms_per_update) / max(compute.ms_per_step, 0.01)))
 
 
-def best(rows: list[dict[str, Any]], metric: str = "shown_psnr_moving_db") -> dict[str, Any] | None:
-    """The row with the highest ``metric``; None if no row has it."""
-    known = [row for row in rows if row[metric] is not None]
-    return max(known, key=lambda row: row[metric]) if known else None
-
-
 def mean_over_seeds(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Means over seeds of the rows with the same field, in layers or not, speed and planned update time, with the
     standard errors of the two shown PSNRs (None for a single seed)."""
