@@ -99,6 +99,8 @@ def _simulate(args: argparse.Namespace) -> None:
     found = {**summary(scenario, deployment, args.seconds), "field": config.field, "chosen": chosen[-1]}
     if missing:
         found["lpips_missing"] = missing
+    elif config.lpips != "none":
+        found["lpips_network"] = config.lpips
     if watched is not None:
         found["now_and_all"] = watched.means()
     if args.out is not None:
@@ -225,7 +227,7 @@ def write_output(
     publications = deployment.publications
     out.mkdir(parents=True, exist_ok=True)
     write_json(out / "simulation.json", found)
-    names = ("scenario", "seed", "seconds", "policy", "value", "chosen", "lpips_missing")
+    names = ("scenario", "seed", "seconds", "policy", "value", "chosen", "lpips_missing", "lpips_network")
     write_json(
         out / "edge.json",
         {

@@ -182,11 +182,14 @@ def test_a_policy_is_tried_from_a_library(tmp_path: Path):
     assert trial.shown[:, 1].tolist() == [score.psnr_db for score in trial.scores] and trial.psnr_db > 5.0
 
 
-def test_what_a_learned_policy_decided_is_kept_as_of_a_live_run(tmp_path: Path):
+def test_what_a_learned_policy_decided_and_what_scored_it_is_kept_as_of_a_live_run(tmp_path: Path, monkeypatch):
+    too_large = SimpleNamespace(minimum_side=1000)  # for these images: it is not asked
+    monkeypatch.setattr("edge_server.experiments.virtual.simulate_command.open_lpips", lambda _: (too_large, None))
     Learner(Spec("select", StateLayout(("age", "pose")), hidden=8), 1).save(tmp_path / "policy.npz")
     out, file = tmp_path / "out", write(tmp_path)
     words = ["--seconds", "1.5", "--out", str(out), "--policy", f"bandit:{tmp_path / 'policy.npz'}"]
     assert main([str(file), *words]) == 0
+    assert json.loads((out / "edge.json").read_text())["lpips_network"] == "alex"
     lines = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
     for number in (0, lines[-1]["number"]):
         decided = read_decision(out, number).decision
