@@ -26,7 +26,6 @@ CONVOLUTIONS = {"0": (64, 3, 11), "3": (192, 64, 5), "6": (384, 192, 3), "8": (2
 class Lpips:
     """LPIPS of AlexNet on the CPU, which threads may share. torch is imported at the first distance."""
 
-    network = "alex"
     minimum_side = MINIMUM_SIDE
 
     def __init__(self, features: Path, lin: Path) -> None:

@@ -65,16 +65,6 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
     return policy
 
 
-def make_live_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
-    """``make_policy`` for a live edge. Raises ValueError also for what only virtual time can do."""
-    if name in VIRTUAL_ONLY:
-        raise ValueError(
-            f"policy {name!r} breaks off what the network carries, which a live edge cannot: it runs in "
-            "virtual time only (edge-server simulate, edge-server study); live, use wait"
-        )
-    return make_policy(name, value, rng)
-
-
 def parse_policy(text: str) -> tuple[str, float | None]:
     """Name and value of a policy as people type it: ``threshold:120``, ``all``, ``bandit:FILE`` with FILE
     relative to the working directory (``resolve_checkpoint``). ValueError where the value is not a number."""
@@ -128,7 +118,7 @@ class LivePolicies:
         """name, value: of the first policy. rng: gives the random stream of a policy's name. Raises ValueError
         for a policy that is not possible."""
         self._rng = rng
-        self.first = make_live_policy(name, value, rng(name))
+        self.first = self._made(name, value)
         self.offered = OFFERED if self.first.name in OFFERED else (self.first.name, *OFFERED)
 
     def make(self, name: str, value: float | None) -> Policy:
@@ -139,4 +129,13 @@ class LivePolicies:
             outside = name.startswith(BANDIT) or plugins.is_reference(name)
             known = "what was learned, or is your own, is chosen at the start (--policy)"
             raise ValueError(f"policy {name!r}: {known if outside else 'choose one of ' + ', '.join(self.offered)}")
-        return make_live_policy(name, value, self._rng(name))
+        return self._made(name, value)
+
+    def _made(self, name: str, value: float | None) -> Policy:
+        """``make_policy``. Raises ValueError also for what only virtual time can do."""
+        if name in VIRTUAL_ONLY:
+            raise ValueError(
+                f"policy {name!r} breaks off what the network carries, which a live edge cannot: it runs in "
+                "virtual time only (edge-server simulate, edge-server study); live, use wait"
+            )
+        return make_policy(name, value, self._rng(name))
