@@ -6,16 +6,15 @@ import struct
 from pathlib import Path
 from typing import Any, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.sources import source_constants as tuned
 from camera_node.sources.datasets.records import DatasetError, Image
-from freshfield import payload  # sets OpenCV's size limit before cv2 is imported
+from freshfield import payload
 from freshfield.geometry import Pinhole
 from freshfield.untrusted import check_file, read_bytes
-
-import cv2  # isort: skip
 
 
 def decode_file(path: Path, flags: int) -> NDArray[Any] | None:

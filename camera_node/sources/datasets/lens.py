@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TypeVar, cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.sources import source_constants as tuned
 from camera_node.sources.datasets.records import DatasetError
-from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.geometry import Array, Pinhole, invertible
-
-import cv2  # isort: skip
 
 Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.uint16])
 

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,11 +24,8 @@ from camera_node.sources.datasets.records import (
     missing_note,
 )
 from camera_node.sources.source_constants import SAME_SHAPE
-from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pose
-
-import cv2  # isort: skip
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,8 +26,6 @@ from camera_node.sources.datasets.records import (
 )
 from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.geometry import Pinhole
-
-import cv2  # isort: skip
 
 FILES = ("calib*.json", "rig*.json")  # a folder's rig*.json counts where it has no calib*.json
 _PLACES = ("videos/{}.mp4", "{}.mp4")

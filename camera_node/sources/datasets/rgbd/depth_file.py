@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,8 +19,6 @@ from camera_node.sources.datasets.records import DatasetError
 from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
 from freshfield.limits import USUAL_DEPTH_M
-
-import cv2  # isort: skip
 
 MILLIMETER = 0.001
 _MOST_COUNTS = 65535
