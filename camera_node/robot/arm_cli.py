@@ -53,7 +53,7 @@ TELEOP = """\
 Moves the arm of a scenario as an operator moves a stylus, while its clutch is pressed: scaled, filtered, and
 at every tick within limits of workspace, joints, speed, acceleration and distance between the arm's parts.
 If no message arrives for watchdog_ms, the arm stops. Limits and scale are keys of the scenario's
-source.arm.teleop.
+source.arm.teleop (freshfield scenario keys source lists them).
 
   camera-node simulate-arm cell &                                   an arm on this machine
   camera-node teleop cell --stylus keyboard                         keys are listed when it starts

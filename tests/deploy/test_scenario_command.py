@@ -78,6 +78,7 @@ def test_check_reads_every_section(tmp_path, capsys):
         ("source: {kind: world, scene: castle}", "source: .*castle"),
         ("source: {kind: world, effects: {OWN:Darker: {counts: 256}}}", "Darker.counts: expected .*0 to 255, got 256"),
         ("source: {kind: OWN:Turning, level: 256}", "source.level: expected .*0 to 255, got 256"),
+        ("source: {kind: world, arm: {host: h, cameras: {a: b}, teleop: {speed: 1}}}", "arm.teleop.speed: unknown key"),
         ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
         ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),

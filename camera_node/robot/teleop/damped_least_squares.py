@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from camera_node.robot.arm.kinematics import ArmModel, pose_difference
+from camera_node.robot.arm.settings import TeleopConfig
 from camera_node.robot.teleop import teleop_constants as tuned
-from camera_node.robot.teleop.settings import TeleopConfig
 from freshfield.geometry import Array
 
 

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import PAIRS, PARTS, CapsuleModel
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.arm.settings import TeleopConfig
 from camera_node.robot.teleop import teleop_constants as tuned
-from camera_node.robot.teleop.settings import TeleopConfig
 from freshfield.geometry import Array
 
 # Limits are this much tighter than configured, because sums over a stop round differently at each tick.

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from camera_node.robot.arm.settings import TeleopConfig
 from camera_node.robot.teleop.one_euro_filter import OneEuro
-from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
 from freshfield.geometry import Array, matrix_to_quaternion, quaternion_to_matrix
 

@@ -16,16 +16,14 @@ from camera_node.robot.arm.camera_poses import arm_model, require_arm
 from camera_node.robot.arm.control import confirm_motion, open_stream, stop_event
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.kinematics import ArmModel
-from camera_node.robot.arm.settings import ArmConfig
+from camera_node.robot.arm.settings import TeleopConfig
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop import teleop_constants as tuned
-from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.sinks import ServoSink, Sink, TrajectoryFile
 from camera_node.robot.teleop.stylus import Stylus, open_stylus
 from camera_node.robot.teleop.teleoperator import Teleoperator
 from freshfield.clock import WallClock
-from freshfield.scenario import Scenario, load
-from freshfield.settings import read_settings
+from freshfield.scenario import load
 
 
 def run(args: argparse.Namespace) -> int:
@@ -33,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     the file. Raises ScenarioError and ArmError before the arm moves."""
     scenario = load(args.scenario)
     arm_config = require_arm(scenario)
-    config = teleop_config(scenario, arm_config)
+    config = arm_config.teleop or TeleopConfig()
     model = arm_model(scenario, arm_config)
     if args.seconds is not None and not args.seconds > 0:
         raise ArmError("--seconds: expected a positive number")
@@ -57,11 +55,6 @@ def run(args: argparse.Namespace) -> int:
         sys.stdout.flush()
         os._exit(status)  # the library's destructor would wait for an arm that may be gone
     return status
-
-
-def teleop_config(scenario: Scenario, arm: ArmConfig) -> TeleopConfig:
-    """The section ``source.arm.teleop``. Raises ScenarioError."""
-    return read_settings(TeleopConfig, dict(arm.teleop or {}), f"{scenario.path}: source.arm.teleop")
 
 
 def _sink(file: Path | None, stream: ArmStream | None, model: ArmModel, config: TeleopConfig) -> Sink:

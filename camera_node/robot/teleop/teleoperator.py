@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from camera_node.robot.arm.kinematics import ArmModel
+from camera_node.robot.arm.settings import TeleopConfig
 from camera_node.robot.teleop.damped_least_squares import joint_speeds
 from camera_node.robot.teleop.limits import Limiter
 from camera_node.robot.teleop.mapping import Mapping
-from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
 from freshfield.geometry import Array
 

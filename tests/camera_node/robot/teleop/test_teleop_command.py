@@ -18,8 +18,8 @@ from msgspec.json import encode
 from camera_node.cli import main
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.kinematics import UR3E
+from camera_node.robot.arm.settings import TeleopConfig
 from camera_node.robot.teleop import sinks, teleop_command
-from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import KeyboardStylus, NetworkStylus, open_stylus, parse
 from camera_node.robot.teleop.teleoperator import Command, Teleoperator
 from tests.camera_node.robot.arm.simulated import write_cell

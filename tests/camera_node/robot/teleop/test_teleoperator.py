@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from camera_node.robot.arm import ArmError
 from camera_node.robot.arm.capsules import CapsuleModel
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
+from camera_node.robot.arm.settings import TeleopConfig
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.robot.teleop.damped_least_squares import commanded_twist, joint_speeds
 from camera_node.robot.teleop.limits import JointRates, Limiter
 from camera_node.robot.teleop.mapping import Mapping
 from camera_node.robot.teleop.one_euro_filter import OneEuro
-from camera_node.robot.teleop.settings import TeleopConfig
 from camera_node.robot.teleop.stylus import StylusSample
 from camera_node.robot.teleop.teleoperator import SILENT, Command, Teleoperator
 from freshfield.geometry import se3, so3_exp
