@@ -11,7 +11,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from camera_node import node_constants as tuned
-from camera_node.capture_schedule import CaptureSchedule, RateSchedule
 from camera_node.clocks import ClockError, NodeClock
 from camera_node.settings import SourceConfig
 from camera_node.sources.base import Shot, Source
@@ -91,15 +90,6 @@ class Camera:
     def clock(self, true: Clock) -> NodeClock:
         """The clock with which this camera stamps frames. true: tells the true time."""
         return NodeClock(true, self._clock_error)
-
-    def schedule(self, start_ns: int) -> CaptureSchedule:
-        """The instants at which it captures, see ``Source.schedule``."""
-        return self.source.schedule(start_ns)
-
-    @property
-    def rate_schedule(self) -> RateSchedule:
-        """The instants of the source's ticks."""
-        return self.source.rate_schedule()
 
     def cached(self, tick: int) -> Shot | None:
         """The tick's shot if it is cached, else None."""

@@ -120,9 +120,9 @@ def _open(args: argparse.Namespace) -> tuple[Scenario, list[Camera]]:
     from camera_node.settings import source_config
 
     arm_cli.log_to_stderr(logging.WARNING if args.quiet else logging.INFO)
-    names = args.names
-    scenario = load(args.scenario, args.seed) if names is None else _recording(Path(args.scenario), names, args.seed)
+    names, file = args.names, args.scenario
     try:
+        scenario = load(file, args.seed) if names is None else _recording(Path(file), names, args.seed)
         chosen = scenario.cameras if names is not None else _chosen(scenario, args)
         cameras = build_cameras(scenario, source_config(scenario), chosen, args.data)
     except (ValueError, OSError) as error:
@@ -131,17 +131,12 @@ def _open(args: argparse.Namespace) -> tuple[Scenario, list[Camera]]:
 
 
 def _recording(path: Path, names: str, seed: int | None) -> Scenario:
-    """The scenario that plays a recording or data set. names: as for --as. Raises UsageError."""
+    """The scenario that plays a recording or data set. names: as for --as. Raises UsageError or DatasetError."""
     from camera_node.sources.datasets.formats import find_format
-    from camera_node.sources.datasets.records import DatasetError
 
     pairs = [pair.strip().partition("=") for pair in names.split(",")]
-    try:
-        kind = find_format(path)
-    except DatasetError as error:
-        raise UsageError(str(error)) from None
     assignment = {camera: name for camera, _, name in pairs if name}
-    source = {"kind": kind, "data": str(path.resolve()), "assignment": assignment}
+    source = {"kind": find_format(path), "data": str(path.resolve()), "assignment": assignment}
     try:
         return parse({"cameras": {"ids": [camera for camera, *_ in pairs]}, "source": source}, path, seed)
     except ScenarioError as error:

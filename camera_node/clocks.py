@@ -41,12 +41,11 @@ class ArrivalClock:
     """Converts a device's time stamps to the host's clock, using only the arrival times of its samples.
 
     Samples arrive late, never early, so the smallest difference between arrival and stamp within the last
-    ``window_ns`` estimates the offset between the clocks. Older samples are forgotten, because the clocks
+    ``ARRIVAL_WINDOW_NS`` estimates the offset between the clocks. Older samples are forgotten, because the clocks
     drift apart. The delay of the fastest sample (a cable, a cycle of the device) remains in the result.
     """
 
-    def __init__(self, window_ns: int = tuned.ARRIVAL_WINDOW_NS) -> None:
-        self._window_ns = window_ns
+    def __init__(self) -> None:
         self._least: deque[tuple[int, int]] = deque()  # (arrival, offset), offsets increasing
 
     def host_ns(self, stamp_ns: int, arrived_ns: int) -> int:
@@ -58,6 +57,6 @@ class ArrivalClock:
         while self._least and self._least[-1][1] >= offset:
             self._least.pop()
         self._least.append((arrived_ns, offset))
-        while self._least[0][0] < arrived_ns - self._window_ns:
+        while self._least[0][0] < arrived_ns - tuned.ARRIVAL_WINDOW_NS:
             self._least.popleft()
         return stamp_ns + self._least[0][1]

@@ -10,7 +10,7 @@ import secrets
 from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from camera_node.clocks import NodeClock
 from camera_node.outbox import Outbox
 from camera_node.sender import TAKEN, Sender
 from camera_node.sources.base import Shot
-from freshfield.clock import Clock, WallClock
+from freshfield.clock import WallClock
 from freshfield.files import write_json
 from freshfield.frame import Frame
 from freshfield.ledger import Ledger
@@ -39,7 +39,6 @@ class NodeOptions:
 
     to: HOST:PORT of the next hop.
     transport: TLS and tokens of the connection.
-    clock: true time, which decides when frames are captured; a camera with a wrong clock only stamps with it.
     out: folder for the ledger and the status file; None writes neither.
     seconds: duration of capture; None: until stopped.
     response_timeout_s: see ``Sender``.
@@ -47,7 +46,6 @@ class NodeOptions:
 
     to: str
     transport: Transport
-    clock: Clock = field(default_factory=WallClock)
     out: Path | None = None
     seconds: float | None = None
     response_timeout_s: float = tuned.ANSWER_TIMEOUT_S
@@ -69,8 +67,8 @@ class Node:
         self._scenario = scenario
         self._cameras = cameras
         self._options = options
-        self._clock = options.clock
-        self._clocks: dict[str, NodeClock] = {c.name: c.clock(options.clock) for c in cameras}
+        self._clock = WallClock()  # true time: a camera with a wrong clock only stamps with it
+        self._clocks: dict[str, NodeClock] = {c.name: c.clock(self._clock) for c in cameras}
         self._trouble: dict[str, Counter[str]] = {c.name: Counter() for c in cameras}
         self._syncs: dict[str, ClockSync] = {}
         self._stopping = asyncio.Event()
@@ -153,7 +151,7 @@ class Node:
         log.info("preparing frames%s", "; a synthetic world is rendered first, once" if world else "")
         loop = asyncio.get_running_loop()
         await loop.run_in_executor(self._pool, prepare, self._cameras, self._stopping.is_set)
-        if any(camera.schedule(0).lossless for camera in self._cameras):
+        if any(camera.source.schedule(0).lossless for camera in self._cameras):
             # Wait for the connection: a recording that started earlier would lose its beginning.
             self._enter("connecting")
             while not all(sender.ready for sender in self.senders.values()):
@@ -176,7 +174,7 @@ class Node:
         loop = asyncio.get_running_loop()
         outbox, trouble = self.outboxes[camera.name], self._trouble[camera.name]
         pool = self._own_pools.get(camera.name, self._pool)
-        schedule = camera.schedule(start_ns)
+        schedule = camera.source.schedule(start_ns)
         tick: int | None = schedule.first(self._clock.now_ns())
         sequence = 0
         while tick is not None:

@@ -27,7 +27,7 @@ def trajectory_poses(
     for camera in set(cameras) & set(config.files):
         file, mount = base / config.files[camera], None
         if config.hand_eye:
-            from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND, read_hand_eye
+            from camera_node.robot.arm.hand_eye_mount import EYE_TO_HAND, MountedCameraPoses, read_hand_eye
 
             with errors_of(f"{where}.hand_eye"):
                 mount = read_hand_eye(base / config.hand_eye)
@@ -41,5 +41,5 @@ def trajectory_poses(
             with errors_of(f"{where}.files.{camera}"):
                 found[camera] = read_tum(file, interpolated, max_gap_ns, round(config.start_s * 1e9))
         if mount is not None:
-            found[camera] = mount.camera_poses(found[camera])
+            found[camera] = MountedCameraPoses(found[camera], mount)
     return found

@@ -140,7 +140,7 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         camera = camera_of(scenario)
     assert "cam01: 1 frames do not follow the one before in time" in caplog.text
-    schedule = camera.schedule(7)
+    schedule = camera.source.schedule(7)
     assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (None, 0)
 
 
@@ -151,7 +151,7 @@ def test_cameras_that_are_not_replayed_are_not_waited_for(tmp_path):
         writer.frame(to_request(frame), at_ns)
     writer.close({})
     scenario = replay_scenario(tmp_path / "a.mcap", assignment={"cam00": "x", "cam02": "y"})
-    assert camera_of(scenario).schedule(7).due_ns(0) == 7
+    assert camera_of(scenario).source.schedule(7).due_ns(0) == 7
 
 
 def test_a_recorded_run_replays_with_its_depth(tmp_path):

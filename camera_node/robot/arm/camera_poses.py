@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from camera_node.pose.providers import FixedPose, PoseProvider
-from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, HandEye, read_hand_eye
+from camera_node.robot.arm.hand_eye_mount import EYE_IN_HAND, EYE_TO_HAND, HandEye, MountedCameraPoses, read_hand_eye
 from camera_node.robot.arm.kinematics import MODELS, ArmModel, apply_calibration
 from camera_node.robot.arm.settings import ArmConfig
 from camera_node.settings import beside, errors_of, source_config
@@ -92,5 +92,5 @@ def camera_poses(scenario: Scenario, config: ArmConfig | None, cameras: Iterable
         stream.start()
         log.info("arm at %s: connected; it carries %s", config.host, ", ".join(moving))
         flange = FlangePoses(stream, model, base)
-        poses.update({camera: mounts[camera].camera_poses(flange) for camera in moving})
+        poses.update({camera: MountedCameraPoses(flange, mounts[camera]) for camera in moving})
     return poses

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from camera_node.pose.providers import Closable, FixedPose, PoseProvider
+from camera_node.pose.providers import Closable, PoseProvider
 from camera_node.robot.arm import ArmError
 from freshfield.geometry import GeometryError, Pose
 from freshfield.untrusted import UntrustedError, read_text, read_yaml
@@ -42,12 +42,6 @@ class HandEye:
     transform: NDArray[np.float64]
     time_offset_s: float = 0.0
     details: dict[str, Any] = field(default_factory=dict)
-
-    def camera_poses(self, flange: PoseProvider) -> PoseProvider:
-        """Poses of the camera in the base's axes, from those of the flange."""
-        if self.setup == EYE_TO_HAND:
-            return FixedPose(Pose.from_matrix(self.transform))
-        return MountedCameraPoses(flange, self)
 
 
 class MountedCameraPoses:

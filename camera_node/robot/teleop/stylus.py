@@ -8,7 +8,6 @@ the datagrams. No stylus knows the arm; ``limits`` makes every sample safe for i
 from __future__ import annotations
 
 import contextlib
-import ipaddress
 import logging
 import math
 import os
@@ -24,6 +23,7 @@ import numpy as np
 
 from camera_node.robot.arm import ArmError
 from camera_node.robot.teleop import teleop_constants as tuned
+from freshfield.access import is_loopback
 from freshfield.geometry import Array, matrix_to_quaternion, quaternion_multiply, quaternion_normalize, so3_exp
 
 log = logging.getLogger("camera-node.teleop")
@@ -157,7 +157,7 @@ class NetworkStylus:
     ended = False
 
     def __init__(self, host: str, port: int) -> None:
-        if not _is_loopback(host):
+        if not is_loopback(host):
             raise ArmError(
                 f"--stylus network: other machines reach {host}, and a message moves the arm: run the stylus's driver "
                 "on this machine, and name network:PORT"
@@ -196,13 +196,6 @@ class NetworkStylus:
 
     def close(self) -> None:
         self._socket.close()
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def parse(data: bytes) -> StylusSample | None:

@@ -35,7 +35,7 @@ class NowAndAll:
         self._deployment, self._scorer = deployment, Scorer(background=background)
         self._frames: list[View] = []
         for camera in cameras:
-            schedule, tick = camera.rate_schedule, 0
+            schedule, tick = camera.source.rate_schedule(), 0
             while schedule.due_ns(tick) < 1e9 * seconds:
                 deployment.at(schedule.due_ns(tick), partial(self._take, camera, tick))
                 tick += 1

@@ -104,7 +104,7 @@ class VirtualDeployment:
         self._admission = FrameAdmission(updates.buffer.cameras, ())
         self._node_clocks = {name: camera.clock(self.clock) for name, camera in self._cameras.items()}
         self._tick = dict.fromkeys(self._cameras, 0)
-        self._due = {name: camera.rate_schedule.due_ns for name, camera in self._cameras.items()}
+        self._due = {name: camera.source.rate_schedule().due_ns for name, camera in self._cameras.items()}
         self._used: dict[str, tuple[Frame, ...]] = {}
         """The last two frames of each camera that have images."""
         self._scored_ns: int | None = None

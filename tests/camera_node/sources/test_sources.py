@@ -95,7 +95,8 @@ def test_no_frame_of_a_recording_is_both_held_out_and_trained_on_in_any_round(tm
     held_out = {kept.source.content(tick) for tick in range(100)}
     assert held_out and trained.isdisjoint(held_out)
     assert [kept.source.content(tick) for tick in range(2)] == [0, 8 * 10 // rate]
-    instants = [hand.rate_schedule.due_ns(k) for k in range(14)] + [kept.rate_schedule.due_ns(k) for k in range(2)]
+    counted = ((hand.source.rate_schedule(), 14), (kept.source.rate_schedule(), 2))
+    instants = [schedule.due_ns(k) for schedule, count in counted for k in range(count)]
     assert sorted(instants) == [k * 10**9 // rate for k in range(16)]
     assert kept.capture(1).pose != kept.capture(0).pose
 
