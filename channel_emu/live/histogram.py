@@ -61,13 +61,13 @@ class Histogram:
         found = {f"p{p}": self.percentile_ms(p) for p in (50, 95, 99)}
         return {"mean": self.mean_ms, **found, "max": self.max_ms if self.count else None}
 
-    def linear(self, count: int = tuned.DRAWN_BINS) -> tuple[list[float], list[float]]:
-        """The histogram in ``count`` equal bins up to the percentile ``DRAWN_PERCENT``, for drawing: edges (count + 1,)
-        in ms, and counts (count,); both empty without durations."""
+    def linear(self) -> tuple[list[float], list[float]]:
+        """The histogram in N = ``DRAWN_BINS`` equal bins up to the percentile ``DRAWN_PERCENT``, for drawing: edges
+        (N + 1,) in ms, and counts (N,); both empty without durations."""
         top = self.percentile_ms(tuned.DRAWN_PERCENT)
         if not top:
             return [], []
-        edges = np.linspace(0.0, top, count + 1)
+        edges = np.linspace(0.0, top, tuned.DRAWN_BINS + 1)
         upper = _FLOOR_MS * 10.0 ** (np.arange(len(self._bins)) / _PER_DECADE)
         upper[-1] = max(upper[-1], self.max_ms)
         # The cumulative count is known at the logarithmic edges; between them it is interpolated linearly.

@@ -296,10 +296,9 @@ class Proxy(grpc.GenericRpcHandler):
         while True:
             await self.refresh()
             before_ns = self.events.now_ns() - tuned.KEEP_PATH_NS
-            self.channel.forget(before_ns)
-            for link in self.links.values():
-                if link.model.chain is not None:
-                    link.model.chain.forget(before_ns)
+            for chain in {self.channel.chain, *(link.model.chain for link in self.links.values())}:
+                if chain is not None:
+                    chain.forget(before_ns)
             await asyncio.sleep(tuned.REFRESH_EVERY_S)
 
 

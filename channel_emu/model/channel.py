@@ -78,11 +78,6 @@ class Channel:
             self._faults(link.camera),
         )
 
-    def forget(self, before_ns: int) -> None:
-        """Drop the shared chain's path before an instant."""
-        if self.chain is not None:
-            self.chain.forget(before_ns)
-
     def arrivals(self, camera: str, chain: Chain | None) -> PoissonArrivals | None:
         """The camera's Poisson arrival process; None if frames arrive as they are offered."""
         rates = self._in_force.arrivals.rate_per_ms

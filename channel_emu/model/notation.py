@@ -52,18 +52,6 @@ def rate_per_ms(text: str) -> float:
     return value
 
 
-def section(key: str, text: str, folder: Path) -> dict[str, Any]:
-    """Parse a section of ``channel:`` from its short notation.
-
-    key: ``arrivals``, ``service`` or ``chain``; text: as the function of that name takes it.
-    folder: what file names are relative to.
-    Raises NotationError.
-    """
-    if key == "service":
-        return service(text, folder)
-    return arrivals(text) if key == "arrivals" else chain(text)
-
-
 def fault(text: str) -> dict[str, Any]:
     """Parse a fault, ``NAME:VALUE``; the value is YAML, a mapping of parameters or the first parameter alone.
 

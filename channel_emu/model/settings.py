@@ -16,10 +16,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from channel_emu.model import faults as fault_modules
+from channel_emu.model import notation
 from channel_emu.model.chain import ChainError, check_generator, stationary, two_state_generator
 from channel_emu.model.faults import per_state
 from channel_emu.model.link import Discipline
-from channel_emu.model.notation import section
 from channel_emu.model.presets import preset
 from freshfield.plugins import PluginError
 from freshfield.settings import ScenarioError, Settings, about, as_mapping, read_settings, within
@@ -214,7 +214,9 @@ def from_notation(key: Any, value: Any, where: str = "channel", folder: Path = P
     if key not in NOTATIONS or not isinstance(value, str):
         return value
     try:
-        return section(key, value, folder)
+        if key == "service":
+            return notation.service(value, folder)
+        return notation.arrivals(value) if key == "arrivals" else notation.chain(value)
     except ValueError as error:
         raise ScenarioError(f"{where}.{key}: {error}") from None
 

@@ -307,7 +307,7 @@ async def test_a_full_disk_ends_the_emulator_and_its_other_books_are_closed(tmp_
 async def test_a_part_that_breaks_ends_the_emulator(tmp_path):
     """With an error that is no OSError."""
     proxy, _ = make(tmp_path, f"127.0.0.1:{free_port()}", SHORT)
-    proxy.channel.forget = mock.Mock(side_effect=ChainError("no such state"))
+    proxy.refresh = mock.Mock(side_effect=ChainError("no such state"))
     with pytest.raises(EmulatorFailed, match="ChainError: no such state"):
         async with asyncio.timeout(15):
             await proxy.run(asyncio.Event())
