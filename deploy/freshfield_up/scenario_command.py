@@ -51,19 +51,19 @@ def _show(args: argparse.Namespace) -> int:
 
 def _init(args: argparse.Namespace) -> int:
     model = load(args.like)
-    name, beside = args.file.stem, model.path.with_suffix("")
+    name = args.file.stem
     if args.file.suffix != ".yaml" or not valid_id(name):
         raise ScenarioError(f"{args.file}: expected a name of letters, digits, '.', '_' and '-' that ends in .yaml")
     text = model.path.read_text(encoding="utf-8")
-    targets = [args.file]
-    if model.path.parent == SCENARIO_FOLDER and beside.is_dir():  # files that the scenario names
-        targets.append(args.file.parent / beside.name)
-    for target in targets:
+    folders = []  # of files that the scenario names
+    if model.path.parent == SCENARIO_FOLDER:
+        folders = [folder for folder in SCENARIO_FOLDER.iterdir() if folder.is_dir() and f" {folder.name}/" in text]
+    for target in (args.file, *(args.file.parent / folder.name for folder in folders)):
         if target.exists():
             raise ScenarioError(f"{target}: exists; choose another name or folder, or remove it first")
     args.file.parent.mkdir(parents=True, exist_ok=True)
-    for target in targets[1:]:
-        shutil.copytree(beside, target)
+    for folder in folders:
+        shutil.copytree(folder, args.file.parent / folder.name)
     args.file.write_text(re.sub(r"(?m)^name: .*$", f'name: "{name}"', text), encoding="utf-8")
     step = f"freshfield scenario check {args.file}"
     if model.source.get("data") == "rig.json":  # a video's calibration

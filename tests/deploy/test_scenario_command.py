@@ -13,6 +13,7 @@ import jsonschema
 import numpy as np
 import pytest
 
+from camera_node.robot.arm.camera_poses import load_hand_eyes
 from camera_node.settings import LiveConfig, source_config
 from camera_node.sources.registry import open_sources
 from channel_emu.model import faults
@@ -49,7 +50,7 @@ def test_the_list_names_each_shipped_scenario_and_the_data_that_it_needs(capsys)
     assert "[--data: fox]" in lines["fox"] and "--data" not in lines["room"]
 
 
-@pytest.mark.parametrize("name", ["card", "videos"])
+@pytest.mark.parametrize("name", ["card", "videos", "cell", "scan"])
 def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path, capsys):
     mine = tmp_path / "new" / "mine.yaml"
     said = printed(capsys, "scenario", "init", str(mine), "--like", name)
@@ -58,6 +59,9 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     text = printed(capsys, "scenario", "show", str(mine))
     assert '\nname: "mine"\n' in text and text.count("\n") == printed(capsys, "scenario", "show", name).count("\n")
     assert "valid" in printed(capsys, "scenario", "check", str(mine))
+    if name in ("cell", "scan"):
+        scenario = load(mine)
+        assert load_hand_eyes(scenario, source_config(scenario).arm, ["hand"])["hand"].setup == "eye-in-hand"
     assert "exists" in refused(capsys, "scenario", "init", str(mine))
     assert mine.read_text() == text
     assert "expected a name" in refused(capsys, "scenario", "init", str(tmp_path / "a: b.yaml"))

@@ -185,7 +185,7 @@ def test_a_simulated_arm_and_its_driver_belong_to_the_run(monkeypatch, tmp_path)
 def test_the_cell_runs_from_one_command(tmp_path):
     require_ur_rtde()
     mount = CELL.path.parent / CELL.source["arm"]["cameras"]["hand"]
-    text = CELL.path.read_text().replace("../lab/hand-eye-example.yaml", str(mount))
+    text = CELL.path.read_text().replace("cell/hand-eye.yaml", str(mount))
     text = re.sub(r"host: \S+", f"host: {own_address()}", text)
     (tmp_path / "cell.yaml").write_text(text.replace("width: 128", "width: 48").replace("height: 128", "height: 48"))
     words = [str(tmp_path / "cell.yaml"), "--out", str(out := tmp_path / "run"), "--port", str(free_port())]
