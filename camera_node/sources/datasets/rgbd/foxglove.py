@@ -57,8 +57,6 @@ class FoxgloveMessages(Messages):
 
     def read(self, topic: str | None = None, log_ns: int = 0) -> Iterator[tuple[str, int, Record]]:
         try:
-            from google.protobuf.message import DecodeError
-            from mcap.exceptions import McapError
             from mcap.reader import make_reader
 
             kinds = (_CALIBRATION, _COMPRESSED, _RAW, _TRANSFORM)
@@ -72,8 +70,8 @@ class FoxgloveMessages(Messages):
                     kind, t_ns = "" if schema is None else schema.name.removeprefix("foxglove."), message.log_time
                     if kind in classes:
                         yield channel.topic, t_ns, _record(kind, classes[kind].FromString(message.data), t_ns)
-        except (OSError, McapError, DecodeError, ValueError, EOFError) as error:
-            why = error or type(error).__name__
+        except Exception as error:  # of damaged files its readers raise nearly anything
+            why = " ".join(str(error).split()) or type(error).__name__
             raise DatasetError(f"{self.where}: cannot be read as MCAP: {why}; cut short? (`mcap recover`)") from None
 
 

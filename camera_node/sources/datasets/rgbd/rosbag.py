@@ -77,7 +77,7 @@ class BagMessages(Messages):
                 raise self._unreadable(error) from None
 
     def _unreadable(self, error: Exception) -> DatasetError:
-        text = str(error) or type(error).__name__
+        text = " ".join(str(error).split()) or type(error).__name__
         return DatasetError(f"{self.where}: cannot be read as a ROS bag: {text}; cut short? (MCAP: `mcap recover`)")
 
 

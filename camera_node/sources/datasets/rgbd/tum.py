@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from camera_node.node_constants import MAX_STAMP_S
 from camera_node.pose.pairing import PoseGapError
+from camera_node.pose.providers import PoseGapError, read_tum
 from camera_node.pose.trajectory_file import read_tum
 from camera_node.sources import source_constants as tuned
 from camera_node.sources.datasets.lens import Lens
@@ -62,6 +64,10 @@ def _listed(file: Path) -> list[tuple[int, str]]:
     """Times (ns) and files of a list. Raises DatasetError."""
     try:
         lines = [line.split() for line in read_text(file).splitlines() if line.strip() and line.strip()[0] != "#"]
-        return [(round(float(seconds) * 1e9), name) for seconds, name in lines]
-    except (OSError, ValueError, OverflowError) as error:
+        listed = [(float(seconds), name) for seconds, name in lines]
+    except (OSError, ValueError) as error:
         raise DatasetError(f"{file}: expected lines of seconds and file: {error}") from None
+    for time_s, _ in listed:
+        if not abs(time_s) <= MAX_STAMP_S:
+            raise DatasetError(f"{file}: the time {time_s:g} cannot be in seconds")
+    return [(round(time_s * 1e9), name) for time_s, name in listed]

@@ -377,7 +377,8 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
         (changed("sparse/0/cameras.bin", lambda d: d[:12] + b"\x0a\0\0\0" + d[16:]), "model 10: expected one of"),
     ],
     "tum": [
-        (written("rgb.txt", "nan rgb/1.png\n"), "rgb.txt: expected lines of seconds and file"),
+        (written("rgb.txt", "nan rgb/1.png\n"), "rgb.txt: the time nan cannot be in seconds"),
+        (written("depth.txt", "1305031102175304000 depth/1.png\n"), "depth.txt: the time 1.3.* cannot be in seconds"),
         (written("groundtruth.txt", "5 0 0 0 0 0 0 1\n"), "3 of 3 images have no pose within 20 ms"),
         (written("rgb.txt", "1305031102.175304 ../x.png\n"), "does not lie within the folder"),
     ],

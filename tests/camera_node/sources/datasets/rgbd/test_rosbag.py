@@ -205,6 +205,8 @@ def test_a_damaged_bag_is_named_and_one_without_poses_says_so(tmp_path):
     for data in (b"", whole[:20], b"RIFF" + whole):
         (bag / "run.mcap").write_bytes(data)
         fails("run: cannot be read as a ROS bag", open_dataset, bag)
+    (bag / "metadata.yaml").write_text("a: b\nc\n")
+    fails("run: cannot be read as a ROS bag", open_dataset, bag)
     bare = write(tmp_path / "bare", pictures())
     fails(f"no image in ROS messages .*: {EYE} has no CameraInfo", open_dataset, bare)
     gone = [transform(START_NS + n * 10**10, "map", "base", MOUNT) for n in (1, 2)]
@@ -284,7 +286,7 @@ def test_images_depth_and_poses_of_a_recording(tmp_path, encoding):
 def test_damage_of_a_file_is_named(tmp_path):
     file = write_foxglove(tmp_path / "run.mcap")
     whole = file.read_bytes()
-    for data in (b"", whole[:-100], b"RIFF" + whole):
+    for data in (b"", whole[:-100], b"RIFF" + whole, whole.replace(bytes.fromhex("28b52ffd"), bytes(4))):  # Zstandard
         file.write_bytes(data)
         fails(r"run\.mcap: cannot be read as MCAP", open_dataset, file)
     fails(r"nine numbers K, and plumb_bob's", open_dataset, write_foxglove(file, d=(0.1, 0, 0, 0, 0, 0.3)))
