@@ -147,11 +147,13 @@ class Proxy(grpc.GenericRpcHandler):
             for task in self._tasks:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)
-            if self.streams_last:  # the grace period would wait in vain
-                for call in {call for link in self.links.values() for call in link.calls}:
-                    if isinstance(call, ServedCall):
-                        call.end(grpc.StatusCode.UNAVAILABLE, "the channel emulator ends")
-            await self._server.stop(tuned.STOP_GRACE_S)
+            # gRPC prints a traceback for each call that it cancels itself, so none is left to it.
+            stopping = asyncio.ensure_future(self._server.stop(2 * tuned.STOP_GRACE_S))
+            await asyncio.wait((stopping,), timeout=0.0 if self.streams_last else tuned.STOP_GRACE_S)
+            for call in {call for link in self.links.values() for call in link.calls}:
+                if isinstance(call, ServedCall):
+                    call.end(grpc.StatusCode.UNAVAILABLE, "the channel emulator ends")
+            await stopping
             await self.service_channel.close()
 
     def fail(self, error: BaseException) -> None:

@@ -167,6 +167,15 @@ def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter):
     assert report.delivered == report.outcomes["forwarded"] + report.outcomes.get("cancelled", 0)
 
 
+def test_calls_that_are_open_at_the_end_are_told_so_and_nothing_is_printed(channel, greeter, caplog):
+    link = channel("ideal", to=greeter.address)
+    call = client(link).unary_stream(COUNT)(b"1000", timeout=30)
+    next(call)
+    link.close()
+    assert code_of(lambda **_: list(call)) == "UNAVAILABLE" and call.details() == "the channel emulator ends"
+    assert caplog.text == ""
+
+
 def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(channel, greeter, monkeypatch):
     monkeypatch.setattr(call_flow.CallFlow, "most_behind", 10)
     link = channel({"service": "det:300ms", "discipline": "fcfs", "queue_limit": 1000}, to=greeter.address)
