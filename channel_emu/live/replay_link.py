@@ -9,12 +9,15 @@ from channel_emu.model.nanoseconds import NEVER_NS
 from channel_emu.model.service_time import ServiceTime, replayed
 from channel_emu.model.trace import Record, TraceError
 
+_NOT_RECORDED = Record("", "", 0, 0, 0, 0, None, None, 0, None, None, None, None)
+
 
 class ReplayLink(Link):
     """A link that repeats a recording instead of making decisions.
 
     Offer ``n`` gets the recorded outcome of offer ``n``, with the recorded delay after its offer. Offers at
     the recorded instants reproduce the recording exactly. After the last record it continues with the first.
+    An offer whose record a killed recording lost is dropped, so that those after it keep their records.
 
     records: of this camera, in the order of their numbers. Raises TraceError if there are none.
     """
@@ -23,7 +26,8 @@ class ReplayLink(Link):
         if not records:
             raise TraceError(f"the trace holds no frame of {camera}")
         super().__init__(camera, "parallel", ServiceTime(replayed([0.0]), [0.0], None))
-        self._records = records
+        self._records = {record.number: record for record in records}
+        self._count = records[-1].number + 1
 
     def _arrive(self, transit: Transit, at_ns: int) -> None:
         record, shift = self._record_of(transit)
@@ -56,7 +60,7 @@ class ReplayLink(Link):
 
     def _record_of(self, transit: Transit) -> tuple[Record, int]:
         """The record of an offer, and how much later the offer is than the recorded one."""
-        record = self._records[transit.number % len(self._records)]
+        record = self._records.get(transit.number % self._count, _NOT_RECORDED)
         return record, transit.offered_ns - record.offered_ns
 
     def _end_of(self, transit: Transit) -> tuple[EventKind, int]:

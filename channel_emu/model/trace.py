@@ -44,7 +44,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     camera: str
     session: str
     sequence: int
-    number: int
+    number: Annotated[int, Meta(ge=0)]
     bytes: Annotated[int, Meta(ge=0, le=MAX_SIZE_BYTES)]
     offered_ns: Instant
     arrived_ns: Instant | None

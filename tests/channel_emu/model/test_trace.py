@@ -62,6 +62,11 @@ def test_a_recorded_trace_is_replayed_event_by_event_and_starts_over(tmp_path, p
             )
         assert link.in_flight == 0 and link.next_event_ns >= 2**62
     refused(TraceError, "cam09", ReplayLink, "cam09", [])
+    *kept, _, last = records  # a killed recording has the last outcome, and not the one before
+    link = ReplayLink(camera, [*kept, last])
+    transits = [link.offer(r.offered_ns)[0] for r in records]
+    link.advance(10**12)
+    assert (transits[-2].outcome, transits[-1].arrived_ns) == ("superseded", last.arrived_ns)
 
 
 def test_damaged_traces_are_refused_with_the_place(tmp_path):
@@ -70,6 +75,7 @@ def test_damaged_traces_are_refused_with_the_place(tmp_path):
         (0, '"freshfield_trace":2', '"freshfield_trace":1', "version 1, expected 2: record it again"),
         (0, '"seed":', '"seed":1e999, "of":', "no trace header"),
         (1, '"camera"', '"kamera"', "line 2 is not a trace record"),
+        (1, '"number":', '"number":-1', r"line 2 .*`\$.number`"),
         (1, '"bytes":', '"bytes":1' + "0" * 400, r"line 2 .*`\$.bytes`"),
         (1, '"flips":[]', '"flips":[[0.5,1e999]]', "line 2 is not a trace record"),
         (1, "{", "[" * 100_000, "line 2 is not a trace record"),
