@@ -250,7 +250,7 @@ def _network(to: str, security: transport.Transport) -> str:
     host, port = transport.host_port(to)
     try:
         begin = time.perf_counter()
-        socket.create_connection((host, port), tuned.ANSWER_S).close()
+        socket.create_connection(transport.socket_address(to), tuned.ANSWER_S).close()
         connect_ms = 1e3 * (time.perf_counter() - begin)
     except OSError as error:
         raise ValueError(

@@ -76,7 +76,7 @@ class Proxy(grpc.GenericRpcHandler):
     """Usage: ``start``, then ``stop``; or ``run``. Needs a running event loop.
 
     config, seed: of the emulated channel. most_calls: open at once; each takes 30 kB.
-    Raises OSError if the trace cannot be created, and TransportError.
+    Raises TransportError if the address cannot be used, OSError if the trace cannot be created.
     """
 
     streams_last: ClassVar[bool] = False
@@ -98,27 +98,27 @@ class Proxy(grpc.GenericRpcHandler):
         """Delays of all links together."""
         self._budget = ByteBudget()
         self.links: dict[str, LiveLink] = {}
-        self.port = 0
         self._failure: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self.events = EventQueue(self.clock, self.origin_ns, self.fail, shared=config.server.shared)
+        self._server = options.transport.aio_server(most_calls)
+        # Before any file: an emulator that has the address already may be writing it.
+        self.port = self.bind()
         self._trace = TraceWriter(options.trace, config, seed) if options.trace else None
         self._replayed = options.replay.by_camera() if options.replay else {}
         self._calls = 0
         self._tasks: list[asyncio.Task[None]] = []
-        self._server = options.transport.aio_server(most_calls)
         self.service_channel = options.transport.aio_channel(options.to, self.client_options)
 
     async def start(self) -> int:
-        """Start to listen. Returns the port. Raises TransportError if the address cannot be used."""
+        """Start to answer. Returns the port."""
         self._server.add_generic_rpc_handlers((self,))
-        self.port = self.options.transport.bind(self._server, self.options.listen)
         self.spawn(self._refresh())
         await self.prepare(self._server)
         await self._server.start()
         return self.port
 
     async def run(self, stop: asyncio.Event) -> Report:
-        """Start, run until ``stop`` is set, and return the report. Raises EmulatorFailed, TransportError."""
+        """Start, run until ``stop`` is set, and return the report. Raises EmulatorFailed."""
         await self.start()
         log.info("listening on port %d, sending to %s", self.port, self.options.to)
         stopping = asyncio.ensure_future(stop.wait())
@@ -224,6 +224,10 @@ class Proxy(grpc.GenericRpcHandler):
                 await self._carry(details.method, context, call)
 
         return grpc.stream_stream_rpc_method_handler(carry)
+
+    def bind(self) -> int:
+        """Take the address to listen on. Returns the port. Raises TransportError."""
+        return self.options.transport.bind(self._server, self.options.listen)
 
     async def prepare(self, server: grpc.aio.Server) -> None:
         """Called before the server accepts calls."""

@@ -25,7 +25,7 @@ from channel_emu.live.live_link import Flips, LiveLink, Message
 from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.model.link import EventKind
 from channel_emu.model.settings import ChannelConfig
-from freshfield.transport import TransportError, host_port
+from freshfield.transport import TransportError, socket_address
 
 log = logging.getLogger("channel-emu")
 
@@ -100,16 +100,21 @@ class TcpProxy(Proxy):
         self._open: set[asyncio.Task[None]] = set()
         self._listening: asyncio.Server | None = None
 
-    async def start(self) -> int:
-        """Start to listen. Returns the port. Raises TransportError if the address cannot be used."""
-        host, port = host_port(self.options.listen)
+    def bind(self) -> int:
+        """See ``Proxy``."""
+        host, port = socket_address(self.options.listen)
         if words := self.options.transport.guard(host, "TCP"):
             log.warning("--insecure: %s", words)
         try:
-            self._listening = await asyncio.start_server(self._accept, host, port)
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            self._socket = socket.create_server((host, port), family=family)
         except OSError as error:
             raise TransportError(f"cannot listen on {self.options.listen}: {error.strerror or error}") from None
-        self.port = self._listening.sockets[0].getsockname()[1]
+        return int(self._socket.getsockname()[1])
+
+    async def start(self) -> int:
+        """Start to answer. Returns the port."""
+        self._listening = await asyncio.start_server(self._accept, sock=self._socket)
         self.spawn(self._refresh())
         return self.port
 
@@ -151,9 +156,9 @@ class TcpProxy(Proxy):
         self._connections += 1
         try:
             async with asyncio.timeout(tuned.CONNECT_TIMEOUT_S):
-                there, back = await asyncio.open_connection(*host_port(self.options.to))
+                there, back = await asyncio.open_connection(*socket_address(self.options.to))
         except OSError as error:  # TimeoutError is one
-            log.warning("%s does not answer: %s", self.options.to, error or "timeout")
+            log.warning("%s does not answer: %s", self.options.to, str(error) or "timeout")
             return
         name, both = f"connection{self._connections}", Connection(back, writer)
         up = Pipe(name, both, self._link_of("up", "bytes"), self.events.now_ns)

@@ -106,6 +106,12 @@ def host_port(text: str) -> tuple[str, int]:
     return host or "127.0.0.1", int(port)
 
 
+def socket_address(text: str) -> tuple[str, int]:
+    """As ``host_port``, the host as sockets take it: an IPv6 one without brackets."""
+    host, port = host_port(text)
+    return host.removeprefix("[").removesuffix("]"), port
+
+
 def peer(option: str, text: str) -> str:
     """Check HOST:PORT of a peer to connect to (port from 1). option: named in the TransportError raised."""
     try:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from channel_emu.live.live_emulator_constants import PIECE_BYTES, PIECES_BEHIND, RESEND_AFTER_S
-from channel_emu.live.proxy import ProxyOptions
+from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.tcp_proxy import TcpProxy
 from channel_emu.model import trace
 from channel_emu.model.settings import channel_from_mapping
@@ -21,7 +21,7 @@ DATA = np.random.default_rng(0).integers(0, 256, 20 * PIECE_BYTES + 5, np.uint8)
 
 
 @contextlib.asynccontextmanager
-async def echo(section: dict, **options) -> AsyncIterator[TcpProxy]:
+async def echo(section: dict, host: str = "127.0.0.1", **options) -> AsyncIterator[TcpProxy]:
     """A proxy before a service that sends back what it gets."""
 
     async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -30,9 +30,9 @@ async def echo(section: dict, **options) -> AsyncIterator[TcpProxy]:
             await writer.drain()
         writer.write_eof()
 
-    service = await asyncio.start_server(answer, "127.0.0.1", 0)
-    to = f"127.0.0.1:{service.sockets[0].getsockname()[1]}"
-    proxy = TcpProxy(channel_from_mapping(section), 3, ProxyOptions("127.0.0.1:0", to, **options))
+    service = await asyncio.start_server(answer, host.strip("[]"), 0)
+    to = f"{host}:{service.sockets[0].getsockname()[1]}"
+    proxy = TcpProxy(channel_from_mapping(section), 3, ProxyOptions(f"{host}:0", to, **options))
     await proxy.start()
     try:
         yield proxy
@@ -44,7 +44,7 @@ async def echo(section: dict, **options) -> AsyncIterator[TcpProxy]:
 
 async def through(proxy: TcpProxy, data: bytes) -> bytes:
     """What comes back for ``data``."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", proxy.port)
+    reader, writer = await asyncio.open_connection(*proxy._listening.sockets[0].getsockname()[:2])
     writer.write(data)
     writer.write_eof()
     try:
@@ -123,14 +123,21 @@ async def test_a_reset_breaks_connections_and_the_next_one_works():
         await asyncio.create_task(proxy._accept(silent, writer))  # ends its connection, not the proxy: ``echo`` checks
 
 
+@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this system has no IPv6")
+async def test_ipv6_addresses_stand_in_brackets():
+    async with echo({}, "[::1]") as proxy:
+        assert await through(proxy, b"once") == b"once"
+
+
 @pytest.mark.stability
-async def test_no_service_and_no_port():
+async def test_no_service_and_no_port(tmp_path):
     proxy = TcpProxy(channel_from_mapping({}), 0, ProxyOptions("127.0.0.1:0", f"127.0.0.1:{free_port()}"))
     await proxy.start()
     assert await through(proxy, b"anybody?") == b""
     for listen in (f"127.0.0.1:{proxy.port}", "0.0.0.0:0"):
-        other = TcpProxy(channel_from_mapping({}), 0, ProxyOptions(listen, "127.0.0.1:1"))
-        with pytest.raises(TransportError, match="cannot listen"):
-            await other.start()
-        await other.stop()
+        options = ProxyOptions(listen, "127.0.0.1:1", trace=tmp_path / "t.jsonl")
+        for kind in (Proxy, TcpProxy):
+            with pytest.raises(TransportError, match="cannot listen"):
+                kind(channel_from_mapping({}), 0, options)
+        assert not options.trace.exists()  # whoever has the port may be writing it
     await proxy.stop()
