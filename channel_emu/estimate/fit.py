@@ -182,9 +182,10 @@ def _data_warnings(recording: Recording, constant: bool, loses: bool, states: st
     notes = []
     waits = recording.discipline in ("fcfs", "parallel")
     if recording.inferred and loses and not waits:
+        also, wrong = ("", "too high") if recording.discipline == "drop-new" else (" and waiting ones do not", "wrong")
         notes.append(
-            "frames dropped while a lost one was in transmission count as lost too, so losses come out too high where "
-            "delays exceed the frame period: a column outcome (delivered, lost, dropped_busy) tells them apart"
+            f"frames dropped while a lost one was in transmission count as lost too{also}, so losses come out {wrong} "
+            "where delays exceed the frame period: a column outcome (delivered, lost, dropped_busy) tells them apart"
         )
     if constant:
         what = "states are told apart by losses alone" if loses else "there is nothing to tell states by"

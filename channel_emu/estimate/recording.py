@@ -9,7 +9,8 @@ other link, one frame a line::
 
 A frame that never came has no delivered_ms; the camera may be left out, and delay_ms may stand for delivered_ms.
 A column outcome (``link.EventKind``, as ``channel-emu simulate --csv`` writes) says why one never came. Without
-it, one that finds no delivered frame in service counts as lost, also where a lost one was in service.
+it, one that finds no delivered frame in service counts as lost, also where a lost one was in service; on a link that
+drops none (fcfs, parallel), every one.
 Columns may be in any order, with their units (``channel_emu.model.table``).
 """
 
@@ -33,7 +34,8 @@ from freshfield.untrusted import read_text
 # Longer than any stream lives. Longer delays are left out; a row with one counts as not delivered.
 MAX_DELAY_MS = 1e9
 LOST = (str(EventKind.LOST), str(EventKind.BROKEN))
-_NEVER_SENT = frozenset(map(str, (EventKind.DROPPED_BUSY, EventKind.SUPERSEDED, EventKind.SKIPPED)))
+_NEVER_SENT = (str(EventKind.DROPPED_BUSY), str(EventKind.SUPERSEDED))
+_OUTCOMES = (str(EventKind.DELIVERED), *LOST, *_NEVER_SENT)
 _MAX_ROWS_MS = 1e12
 
 
@@ -163,6 +165,13 @@ def _from_rows(path: Path, discipline: str) -> Recording:
                 )
             then = math.nan if then - at > MAX_DELAY_MS else then
             why = row[outcome] if outcome is not None else ""
+            if why == EventKind.SKIPPED:
+                raise TableError(
+                    "an arrival process sampled the frames (outcome skipped), and rows do not say when: simulate "
+                    "without --frame-period-ms, or fit a --trace"
+                )
+            if why not in ("", *_OUTCOMES):
+                raise TableError(f"line {line}: outcome is {why!r:.40}, expected {', '.join(_OUTCOMES)}, or blank")
             rows.setdefault((row[camera] if camera is not None else "") or "cam00", []).append((at, then, why))
     except TableError as error:
         raise RecordingError(f"{path}: {error}") from None
@@ -200,36 +209,41 @@ def _camera_of_rows(
     name: str, rows: list[tuple[float, float, str]], first: float, discipline: str, sure_ms: float
 ) -> Camera:
     """Infer starts and outcomes of rows (offered, delivered, why not). Transmission starts at the offer, or when the
-    link becomes free.
+    link becomes free: behind a lost frame that is not known, and neither is the delay.
 
-    An undelivered frame was dropped if its row says so or an earlier one was in service, and lost
-    otherwise. After the last delivery, and on a parallel link from ``sure_ms`` on, it may still be in service:
-    outcome unknown.
+    An undelivered frame was dropped if its row says so, or if an earlier one was in service on a link that drops, and
+    lost otherwise. If its row does not say so, after the last delivery, and on a parallel link from ``sure_ms`` on, it
+    may still be in service: outcome unknown.
     """
     rows = sorted(rows, key=lambda row: row[0])
     offered, delivered = np.array([row[:2] for row in rows]).T - first
     n = len(offered)
-    started, outcome = np.full(n, math.nan), np.full(n, str(EventKind.LOST), dtype="U16")
-    free = -math.inf
+    started, delay = np.full(n, math.nan), np.full(n, math.nan)
+    outcome = np.full(n, str(EventKind.LOST), dtype="U16")
+    waits, drops = discipline in ("newest-waits", "fcfs"), discipline in ("newest-waits", "drop-new")
+    free, behind_lost = -math.inf, False
     for i in range(n):
         if math.isnan(delivered[i]):
             if rows[i][2] in _NEVER_SENT:
                 outcome[i] = rows[i][2]
-            elif discipline != "parallel" and offered[i] < free:
+            elif rows[i][2] not in LOST and drops and offered[i] < free:
                 newest = discipline == "newest-waits"
                 outcome[i] = str(EventKind.SUPERSEDED if newest else EventKind.DROPPED_BUSY)
+            behind_lost |= bool(outcome[i] == EventKind.LOST)
             continue
         outcome[i] = str(EventKind.DELIVERED)
-        waits = discipline in ("newest-waits", "fcfs")
         started[i] = max(offered[i], free) if waits and free <= delivered[i] else offered[i]
-        free = max(free, float(delivered[i]))
+        if not (waits and behind_lost):
+            delay[i] = delivered[i] - started[i]
+        free, behind_lost = max(free, float(delivered[i])), False
     came = np.flatnonzero(outcome == EventKind.DELIVERED)
     if len(came):
         unknown = np.arange(n) > came[-1]
         if discipline == "parallel":
             unknown |= offered >= sure_ms
-        outcome[unknown & (outcome == EventKind.LOST)] = ""
-    return Camera(name, offered, offered, started, delivered - started, outcome)
+        said = np.array([row[2] in LOST for row in rows])
+        outcome[unknown & ~said & (outcome == EventKind.LOST)] = ""
+    return Camera(name, offered, offered, started, delay, outcome)
 
 
 Transmissions = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]

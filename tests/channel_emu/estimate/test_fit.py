@@ -114,6 +114,14 @@ def test_rows_behind_a_waiting_place(tmp_path):
     check(fit(path, discipline="newest-waits"), SLOW_TRUE)
 
 
+@pytest.mark.parametrize("discipline", ["fcfs", "newest-waits"])
+def test_lost_frames_that_had_waited_are_losses(tmp_path, discipline):
+    """A frame behind a lost one starts nobody knows when: its delay is left out."""
+    section = {"arrivals": "periodic:30ms", "service": "exp:24ms", "faults": {"loss": 0.1}, "discipline": discipline}
+    simulate(channel_from_mapping(section), 1, 300).write_frames(tmp_path / "rows.csv")
+    check(fit(tmp_path / "rows.csv", discipline=discipline), {"mean_ms": 24.0, "loss": 0.1})
+
+
 def test_what_is_still_on_its_way_is_not_lost(tmp_path):
     """A parallel link recorded until 10 s: late frames that had not come by then are no losses, and one that is
     missing long before is."""
@@ -135,6 +143,8 @@ def test_nothing_to_fit_is_said_in_one_line(tmp_path):
         (HEAD + "0,5\n30,20\n", "line 3: delivered_ms is not earlier than offered_ms, or blank: 30, 20"),
         (HEAD + "0,5\n1e12,\n1.1e12,\n", "line 4: offered_ms is decades away from the first: 1.1e12, "),
         (HEAD + '"' + 140_000 * "0", "cannot be read as a table: field larger than"),
+        (HEAD[:-1] + ",outcome\n0,5,delivered\n30,,drop\n", "line 3: outcome is 'drop', expected delivered, lost, "),
+        (HEAD[:-1] + ",outcome\n0,,skipped\n", "sampled the frames .* or fit a --trace"),
         ("0,5\n30,40\n", "expected a header with the columns offered_ms, .* it has no header"),
     ):
         (tmp_path / "rows.csv").write_text(rows)
