@@ -52,8 +52,8 @@ MAT = Study(
     ),
     ("scene", "channel"),
     (
-        curves("mat", "gamma_ms", "maximum age (ms)", MAT_METRICS, "channel", policy="threshold"),
-        instants("mat", ("room", "kitchen"), "threshold", SHOWN, {"preset": "ch5"}),
+        curves("mat", "gamma_ms", "maximum age (ms)", MAT_METRICS, "channel", of="5.6", policy="threshold"),
+        instants("mat", ("room", "kitchen"), "threshold", SHOWN, {"preset": "ch5"}, of="5.7"),
     ),
 )
 
@@ -89,7 +89,7 @@ def _delay_cases(request: StudyRequest) -> list[Point]:
 
 def _draw_delay(request: StudyRequest, table: SeedTable) -> None:
     for (scene,) in table.distinct("scene"):
-        with figure(request.out / f"mat-delay-{scene}.png", 1, height_inch=3.6) as (_, axes):
+        with figure(request.figure(f"mat-delay-{scene}.png"), 1, height_inch=3.6) as (_, axes):
             at = axes[0, 0]
             delays = [delay for (delay,) in table.distinct("delay_ms")]
             for k, metric in enumerate(MAT_DELAY.metrics):
@@ -156,7 +156,7 @@ def _losses(table: SeedTable, metric: str, labels: Row) -> dict[float, Curve]:
 
 def _draw_lambda(request: StudyRequest, table: SeedTable) -> None:
     for (scene,) in table.distinct("scene"):
-        with figure(request.out / f"lambda-{scene}.png", 1, height_inch=3.6) as (_, axes):
+        with figure(request.figure(f"lambda-{scene}.png"), 1, height_inch=3.6) as (_, axes):
             at = axes[0, 0]
             for k, (metric, policy) in enumerate(product(LAMBDA.metrics, ("threshold", "wait"))):
                 curves = _losses(table, metric, {"scene": scene, "policy": policy})

@@ -127,7 +127,7 @@ def _draw_images(request: StudyRequest, table: SeedTable) -> None:
             color = deployment.updates.field.snapshot(present_ns).render(pose, lens).color
             shown.append((f"depth of {_OF_FRAMES[every]}", to_bytes(color)))
         rows.append((scene_label(scene), [("truth", image), *shown]))
-    draw_images(request.out / "depth-pictures.png", rows)
+    draw_images(request.figure("depth-pictures.png"), rows)
 
 
 def _message_bytes(camera: Camera) -> float:

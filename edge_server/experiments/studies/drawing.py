@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
@@ -12,7 +12,7 @@ from edge_server.experiments.common.drawn_images import Image, draw_images
 from edge_server.experiments.common.seed_table import Curve, Row, SeedTable
 from edge_server.experiments.common.statistics import interval
 from edge_server.experiments.studies.study import StudyRequest
-from edge_server.experiments.studies.trial import last_images, scenes_here, usual_trial
+from edge_server.experiments.studies.trial import last_images, scene_label, scenes_here, usual_trial
 from edge_server.experiments.studies.verdicts import METRICS, NO_DELAY, USE_ALL
 from edge_server.matplotlib_figures import CYCLE, GRAY, figure, label_lines
 
@@ -42,12 +42,19 @@ Draw = Callable[[StudyRequest, SeedTable], None]
 
 
 def curves(
-    name: str, x: str, axis: str, metrics: Sequence[str], by: str, per: Sequence[str] = ("scene",), **where: Any
+    name: str,
+    x: str,
+    axis: str,
+    metrics: Sequence[str],
+    by: str,
+    per: Sequence[str] = ("scene",),
+    of: str | Mapping[str, str] = "",
+    **where: Any,
 ) -> Draw:
     """Makes a drawing of OUT/NAME-SCENE-N.png for each combination of the labels ``per``: a panel for each measured
     metric against label ``x``, a line for each value of label ``by``, and the levels of use-all and of no delay.
 
-    axis: text of x. where: further labels of the points.
+    axis: text of x. of: number of the thesis's figure, also by scene. where: further labels of the points.
     """
 
     def draw(request: StudyRequest, table: SeedTable) -> None:
@@ -58,7 +65,9 @@ def curves(
             lines = [(v, labels) for v, labels in lines if any(row.get(x) is not None for row in table.where(**labels))]
             if not lines:
                 continue
-            path, height_inch = request.out / f"{name}-{here['scene']}-{number}.png", 2.3 if len(measured) < 6 else 1.8
+            scene, height_inch = here["scene"], 2.3 if len(measured) < 6 else 1.8
+            title = _title(of if isinstance(of, str) else of.get(scene, ""), *values)
+            path = request.figure(f"{name}-{scene}-{number}.png", title)
             with figure(path, len(measured), height_inch=height_inch, sharex=True) as (_, axes):
                 for at, metric in zip(axes[:, 0], measured):
                     for k, (label, labels) in enumerate(lines):
@@ -68,7 +77,7 @@ def curves(
                             at.axhline(level, color=GRAY, linestyle=style, linewidth=1.2, label=policy)
                     text = textwrap.fill(METRICS[metric].label, 20)
                     label_lines(at, text, axis if metric == measured[-1] else None)
-                axes[0, 0].set_title(", ".join(map(str, values)))
+                axes[0, 0].set_title(title)
 
     return draw
 
@@ -84,18 +93,18 @@ def _level(table: SeedTable, metric: str, policy: str, here: Row) -> float | Non
 
 
 def instants(
-    name: str, scenes: Sequence[str], policy: str, values: Sequence[float], channel: Row, **settings: Any
+    name: str, scenes: Sequence[str], policy: str, values: Sequence[float], channel: Row, of: str = "", **settings: Any
 ) -> Draw:
     """Makes a drawing of one instant of each scene under some values of a policy, to OUT/NAME-pictures.png: the truth
     and the last rendering of each trial.
 
-    values: in milliseconds. settings: further arguments of ``Trial``.
+    values: in milliseconds. of: number of the thesis's figure. settings: further arguments of ``Trial``.
     """
 
     def draw(request: StudyRequest, table: SeedTable) -> None:
         own = next(iter(request.channels({"": channel}).values()))
         common: Row = {"seed": 3, "channel": own, "lpips": False, "policy": policy, **settings}
-        shown = []
+        title, shown = _title(of, policy), []
         for scene in scenes_here(request, scenes):
             images: list[tuple[str, Image]] = []
             for value in values:
@@ -103,7 +112,12 @@ def instants(
                 if not images:
                     images.append(("truth at the present", truth))
                 images.append((f"{value:g} ms: {row['views']:.0f} views, {row['psnr_db']:.1f} dB", rendering))
-            shown.append((scene, images))
-        draw_images(request.out / f"{name}-pictures.png", shown)
+            shown.append((f"{title}\n{scene_label(scene)}", images))
+        draw_images(request.figure(f"{name}-pictures.png", title), shown)
 
     return draw
+
+
+def _title(of: str, *labels: Any) -> str:
+    """What a figure is called: the thesis's figure, if it is one, and its labels."""
+    return ", ".join([*([f"Figure {of}"] if of else []), *map(str, labels)])

@@ -9,14 +9,14 @@ import dataclasses
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 from edge_server.experiments.common.seed_table import TRAINING, Row
 from edge_server.experiments.engine.content_key import code_digest
 from edge_server.experiments.experiment_constants import QUICK_SPLAT, SCRATCH_STEPS, TRAINING_STEPS
 from edge_server.experiments.rollouts.setting import Setting, layout_of, reward_of, seeds
-from edge_server.experiments.studies.study import StudyRequest, open_engine
+from edge_server.experiments.studies.study import StudyRequest, open_engine, print_once
 from edge_server.experiments.studies.study_constants import TRAININGS
 from edge_server.experiments.studies.trial import Trial
 from edge_server.experiments.training.evaluation import Candidate, evaluate, fixed_candidates
@@ -145,7 +145,7 @@ def _train(
     folder = request.out / "training" / f"{label}-{hashlib.sha256(about.encode()).hexdigest()[:8]}"
     say = partial(print, f"  {label}:", flush=True)
     learner = train(setting, config, request.folders, request.jobs, folder, say, request.ray)
-    draw_curve(request.out / f"{label}.png", read_log(folder))
+    draw_curve(request.figure(f"{label}.png"), read_log(folder))
     return learner.actor
 
 
@@ -153,11 +153,6 @@ def _reward(choice: RewardChoice, request: StudyRequest) -> Any:
     """A preset reward; prints a line, once, if its LPIPS term must be left out."""
     reward, missing = reward_of(choice.name, choice.on, request.folders.lpips)
     if missing:
-        _print_once(missing)
+        print_once(missing)
     weights: dict[str, Any] = dict(choice.weights)
     return dataclasses.replace(reward, **weights)
-
-
-@cache
-def _print_once(line: str) -> None:
-    print(f"  {line}")

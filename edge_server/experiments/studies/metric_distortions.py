@@ -96,7 +96,7 @@ def _draw(request: StudyRequest, table: SeedTable) -> None:
         (label, (im * 255).astype(np.uint8))
         for label, im in [("reference", reference), *distortions(reference).items()]
     ]
-    draw_images(request.out / "metrics.png", [("room", shown)])
+    draw_images(request.figure("metrics.png"), [("room", shown)])
 
 
 def _table(table: SeedTable) -> str:

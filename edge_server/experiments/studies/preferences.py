@@ -233,7 +233,7 @@ def question(features: np.ndarray, scores: np.ndarray, taste: str, habit: str, s
 def _draw(request: StudyRequest, table: SeedTable) -> None:
     """Agreement on unseen pairs against the number of answers; the policies' returns against updates (figure 4.6)."""
     for (scene,) in table.distinct("scene"):
-        with figure(request.out / f"preferences-{scene}.png", 2, height_inch=2.6) as (_, axes):
+        with figure(request.figure(f"preferences-{scene}.png"), 2, height_inch=2.6) as (_, axes):
             top, bottom = axes[:, 0]
             for k, (taste, habit) in enumerate(table.distinct("taste", "habit")):
                 labels = {"scene": scene, "taste": taste, "habit": habit}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ class StudyRequest:
     jobs, ray: as in ``Engine``.
     cases: words in the names of the selected cases, for studies that consist of cases.
     episodes: episodes of one training, for studies that train.
+    figures: names of the figures that the study has drawn, and what each is called; see ``figure``.
     """
 
     quick: bool
@@ -51,6 +53,13 @@ class StudyRequest:
     ray: str | None = None
     cases: tuple[str, ...] = ()
     episodes: int | None = None
+    figures: dict[str, str] = field(default_factory=dict)
+
+    def figure(self, name: str, title: str = "") -> Path:
+        """Where to draw a figure, which the study's page shows. title: which of the thesis's it is, if the study has
+        several."""
+        self.figures[name] = title
+        return self.out / name
 
     def chosen(self, cases: Sequence[str], quick: Sequence[str]) -> list[str]:
         """The selected cases: by default all, or ``quick`` in a quick pass. StudyError for an unknown one."""
@@ -112,8 +121,8 @@ class Study:
 def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
     """Measure the cases without stored results, write OUT/NAME.csv, .md and figures, and return the verdicts.
     Raises StudyError."""
+    request = replace(request, figures={})
     request.out.mkdir(parents=True, exist_ok=True)
-    before = _figures(study, request)
     rows = study.measure(study.cases(request), request)
     write_csv(request.out / f"{study.name}.csv", rows)
     table = SeedTable(rows)
@@ -121,19 +130,11 @@ def run_study(study: Study, request: StudyRequest) -> list[Verdict]:
         for draw in study.draw:
             draw(request, table)
     verdicts = judge(study.claims, study.metrics, study.panels, table)
-    drawn = sorted(name for name, _ in _figures(study, request) - before)
-    write_text(request.out / f"{study.name}.md", markdown(study, request, table, verdicts, drawn))
+    write_text(request.out / f"{study.name}.md", markdown(study, request, table, verdicts))
     return verdicts
 
 
-def _figures(study: Study, request: StudyRequest) -> set[tuple[str, int]]:
-    """Names and times of the figures that are there: also of other scenes, and of a study with a longer name."""
-    return {(path.name, path.stat().st_mtime_ns) for path in request.out.glob(f"{study.name}*.png")}
-
-
-def markdown(
-    study: Study, request: StudyRequest, table: SeedTable, verdicts: Sequence[Verdict], figures: Sequence[str]
-) -> str:
+def markdown(study: Study, request: StudyRequest, table: SeedTable, verdicts: Sequence[Verdict]) -> str:
     """The study as a page: how it was run, how often each claim holds, and folded, where."""
     of_claim = {v.claim: [w for w in verdicts if w.claim == v.claim] for v in verdicts}
     counted = [
@@ -154,9 +155,15 @@ def markdown(
         markdown_table(["claim", "where", "verdict", "found"], each),
         "</details>",
         *([study.tables(table)] if study.tables is not None else []),
-        *(f"![{study.title}]({name})" for name in figures),
+        *(f"![{title or study.title}]({name})" for name, title in sorted(request.figures.items())),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+@cache
+def print_once(line: str) -> None:
+    """Print a line of a study that several of its parts have to say."""
+    print(f"  {line}", flush=True)
 
 
 def open_engine(request: StudyRequest, name: str, threads: int | None = None) -> Engine:

@@ -21,7 +21,7 @@ from edge_server.experiments.common.seed_table import Row
 from edge_server.experiments.common.tables import mean_or_none
 from edge_server.experiments.rollouts.episode import Stage, open_stage
 from edge_server.experiments.studies import study_constants as tuned
-from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine
+from edge_server.experiments.studies.study import StudyError, StudyRequest, open_engine, print_once
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
@@ -162,9 +162,8 @@ def scenes_here(request: StudyRequest, default: Sequence[str]) -> list[str]:
         if file is None or request.folders.data_of(scenario_of(scene)) is not None:
             found.append(scene)
         else:
-            print(
-                f"  {scene} is left out: {file} is not below the data folder (--data or FRESHFIELD_DATA), nor beside it"
-            )
+            where = "below the data folder (--data or FRESHFIELD_DATA), nor beside it"
+            print_once(f"{scene} is left out: {file} is not {where}")
     if not found:
         raise StudyError(f"none of the scenes asked for is here: {', '.join(wanted)}")
     return found

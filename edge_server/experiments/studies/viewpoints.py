@@ -146,7 +146,7 @@ def _draw(request: StudyRequest, table: SeedTable) -> None:
     """Quality and path against the number of views."""
     for (name,) in table.distinct("scene"):
         metrics = [m for m in ("psnr_db", "ssim", "lpips") if any(r[m] is not None for r in table.where(scene=name))]
-        with figure(request.out / f"viewpoints-{name}.png", len(metrics) + 1, height_inch=2.4, sharex=True) as (
+        with figure(request.figure(f"viewpoints-{name}.png"), len(metrics) + 1, height_inch=2.4, sharex=True) as (
             _,
             axes,
         ):

@@ -94,10 +94,18 @@ OMEGA = Study(
     ("scene", "channel"),
     (
         curves(
-            "omega", "omega_ms", "omega (ms)", (*PLATEAU_NEAR, *FRESHNESS, "aaoi_ms"), "policy", ("scene", "channel")
+            "omega",
+            "omega_ms",
+            "omega (ms)",
+            (*PLATEAU_NEAR, *FRESHNESS, "aaoi_ms"),
+            "policy",
+            ("scene", "channel"),
+            of="6.3",
         ),
         *(
-            instants(f"omega-{policy}", ("room", "kitchen"), policy, SHOWN, {"preset": "ch6-high"}, every_ms=2400.0)
+            instants(
+                f"omega-{policy}", ("room", "kitchen"), policy, SHOWN, {"preset": "ch6-high"}, of="6.4", every_ms=2400.0
+            )
             for policy in ("threshold", "wait")
         ),
     ),
@@ -110,6 +118,7 @@ QUICK_COUNTS = (3, 6, 10, 14, 18)
 # The thesis's representations: of cameras that look in (6.5) and that look out (6.6).
 IMAGE_METRICS = ("lpips", "psnr_db", "psnr_moving_db", "aaoi_ms")
 IMAGE_FIELDS = {"room": "nerfacto", "tower": "splat"}
+IMAGE_FIGURES = {"room": "6.5", "tower": "6.6"}
 
 
 def _image_cases(request: StudyRequest) -> list[Point]:
@@ -148,7 +157,7 @@ IMAGES = Study(
         ),
     ),
     ("scene", "field", "channel"),
-    (curves("images", "images", "images, the freshest", (*IMAGE_METRICS, "ssim"), "policy"),),
+    (curves("images", "images", "images, the freshest", (*IMAGE_METRICS, "ssim"), "policy", of=IMAGE_FIGURES),),
 )
 
 # --- figure 6.7 ----------------------------------------------------------------------------------------------

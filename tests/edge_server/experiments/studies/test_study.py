@@ -15,7 +15,7 @@ import yaml
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
 from edge_server.experiments.common.statistics import Interval
-from edge_server.experiments.studies import preferences, study, trial, viewpoints
+from edge_server.experiments.studies import drawing, preferences, study, trial, viewpoints
 from edge_server.experiments.studies.depth_rate import DepthRun, run_with_depth
 from edge_server.experiments.studies.learned_schedulers import LEFT_OUT, WEIGHTED, WHICH_VIEWS
 from edge_server.experiments.studies.learning import FOUR_VIEWPOINTS, REPORT
@@ -298,7 +298,7 @@ def test_a_run_with_depth_counts_bytes_of_all_cameras_and_scores_its_last_third(
     assert 4 * 15 * 0.2 < found[0]["kilobytes_per_s"] < 0.8 * found[1]["kilobytes_per_s"]
 
 
-def test_a_scene_needs_a_held_out_camera(tmp_path: Path):
+def test_a_scene_needs_a_held_out_camera(tmp_path: Path, capsys):
     scenes = [tmp_path / "mine.yaml", tmp_path / "none.yaml"]
     for scene, cameras in zip(scenes, (RAW["cameras"], {"count": 4})):
         scene.write_text(yaml.safe_dump({**RAW, "cameras": cameras}))
@@ -311,7 +311,25 @@ def test_a_scene_needs_a_held_out_camera(tmp_path: Path):
         scenes[0].write_text(yaml.safe_dump({**RAW, "source": {"kind": "transforms", "data": data}}))
         asked = request(tmp_path, scenes=(str(scenes[0]), "tile"))
         trial.recording.cache_clear()
-        assert trial.scenes_here(asked, ()) == [*asked.scenes[:here], "tile"]
+        for _ in range(2):
+            assert trial.scenes_here(asked, ()) == [*asked.scenes[:here], "tile"]
+    assert capsys.readouterr().out.count("is left out") == 1
+
+
+def test_a_page_shows_the_figures_of_its_study_and_what_each_is(tmp_path, monkeypatch):
+    def measure(_: Any, asked: StudyRequest) -> list[dict[str, Any]]:
+        (asked.out / "omega-of-another-process.png").touch()
+        of = {"scene": "room", "channel": "high traffic", "policy": "threshold"}
+        return [{**of, "omega_ms": x, "seed": 0, **figures(0.0, x), **f_w(figures(0.0, x))} for x in (15.0, 60.0)]
+
+    monkeypatch.setattr(drawing, "last_images", lambda *_: (np.zeros((8, 8, 3), np.uint8),) * 2 + ({**figures(0, 0)},))
+    study.run_study(replace(STUDIES["omega"], cases=lambda _: (), measure=measure), request(tmp_path, scenes=("room",)))
+    pages = [line for line in (tmp_path / "omega.md").read_text().splitlines() if line.startswith("![")]
+    assert pages == [
+        "![Figure 6.3, room, high traffic](omega-room-0.png)",
+        "![Figure 6.4, threshold](omega-threshold-pictures.png)",
+        "![Figure 6.4, wait](omega-wait-pictures.png)",
+    ]
 
 
 def test_selectors_stand_in_a_table_of_each_scene():
