@@ -23,6 +23,7 @@ from edge_server.experiments.common.statistics import discoveries, interval, pai
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
+from edge_server.experiments.virtual.simulate_command import check_seconds
 from edge_server.machine import commit, machine
 from edge_server.scheduler import STATE_PARTS, make_policy, parse_policy, short_name
 from edge_server.settings import read_config
@@ -78,7 +79,7 @@ def _run(args: argparse.Namespace) -> None:
     if idle:
         print(f"without an update after the lead: {', '.join(idle)}")
     if args.json is not None:
-        about = {"scenario": setting.scenario.name, "seeds": args.seeds}
+        about = {"scenario": setting.scenario.name, "channel": setting.scenario.channel, "seeds": args.seeds}
         about |= {"seconds": args.seconds, "lead_s": tuned.COMPARE_LEAD_S}
         about |= {"seed": setting.scenario.seed, "judged_from": setting.rewarding, "motions": setting.draws_motions}
         about |= {"compute": as_mapping(setting.compute), "machine": machine(), "commit": commit()}
@@ -91,6 +92,7 @@ def setting_of(scenario: Scenario, seconds: float, channel: str | None = None) -
 
     seconds: scored, after the lead. channel: as in ``read_channel``. Raises ScenarioError or ValueError.
     """
+    check_seconds(seconds)
     scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
     if channel is not None:
         scenario = dataclasses.replace(scenario, channel=read_channel(channel)[0])

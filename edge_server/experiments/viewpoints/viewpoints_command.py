@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Sequence
 
 from camera_node.sources.datasets.records import DatasetError
@@ -60,7 +61,7 @@ def _run(args: argparse.Namespace) -> None:
     folders = folders_of(args)
     budget = read_budget(args.budget)
     selector = make_selector(args.selector)  # refused before anything is rendered
-    if args.travel < 0.0:
+    if not 0.0 <= args.travel < math.inf:
         raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
     stage = open_stage(args.scenario, args.candidates, data=folders.data)
     if isinstance(selector, CandidatePolicy):

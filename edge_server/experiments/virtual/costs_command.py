@@ -24,6 +24,7 @@ from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import add_folders, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
+from edge_server.experiments.virtual.simulate_command import check_seconds
 from edge_server.machine import machine, versions
 from edge_server.settings import ComputeConfig, EdgeConfig, read_config
 from freshfield.files import out_file, write_json
@@ -54,6 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
 
     def work() -> None:
+        check_seconds(args.seconds)
         found = measure(load(args.scenario), args.seconds, folders_of(args).data)
         args.out.parent.mkdir(parents=True, exist_ok=True)
         write_json(args.out, found, indent=1)

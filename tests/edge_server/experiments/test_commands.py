@@ -24,6 +24,8 @@ from tests.support import refusal, refused
     [
         ("compare SMALL hope", "hope"),
         ("compare SMALL all --channel sms", "sms"),
+        ("compare SMALL all --seconds inf", "--seconds: expected more than 0"),
+        ("costs SMALL --seconds nan", "--seconds: expected more than 0"),
         ("compare nowhere all", "shipped scenarios"),
         ("fit SET --option levels", "expected KEY=VALUE"),
         ("fit SET --resume", "no fit to go on from"),
@@ -41,6 +43,7 @@ from tests.support import refusal, refused
         ("train-scheduler room --omegas 20,60", "select takes none"),
         ("train-scheduler room --kind wait --omegas 20,soon", "expected milliseconds such as"),
         ("viewpoints tile --budget many", "expected views"),
+        ("viewpoints tile --budget 4 --travel nan", "--travel nan: expected 0 or more"),
         ("viewpoints tile --budget 4 --selector ppo:none.npz", "not a viewpoint policy"),
         ("viewpoints tower --budget 4", "its cameras look outward"),
         ("viewpoints tile --budget 1 --ask edges", "at least 2 views"),
@@ -107,7 +110,8 @@ def test_the_command_compares_and_goes_on(tmp_path: Path, capsys, monkeypatch):
     printed = capsys.readouterr().out
     assert "freshest-k:2" in printed and "minus all" in printed and "after the lead: wait:60000\n" in printed
     found = json.loads(out.read_text())
-    assert found["compute"]["ms_per_step"] == 2.0 and found["policies"]["freshest-k:2"]["views"][0] <= 2.0
+    assert found["channel"] == {"preset": "ch6-slow"} and found["compute"]["ms_per_step"] == 2.0
+    assert found["policies"]["freshest-k:2"]["views"][0] <= 2.0
     everything, fresh = (found["policies"][name] for name in ("all", "freshest-k:2"))
     assert everything["psnr_db"][0] > 5.0 and everything["psnr_db_over_all"] == [0.0, 0.0, 0.0]
     assert fresh["psnr_db_over_all"][0] == pytest.approx(fresh["psnr_db"][0] - everything["psnr_db"][0])
