@@ -38,8 +38,8 @@ from freshfield.geometry import OPENGL_TO_OPENCV
 
 # First the files from which nerfstudio and NeRF-synthetic start a training.
 FILES = ("transforms.json", "transforms_train.json", "transforms*.json")
-_TRAIN, _TEST = "transforms_train.json", "transforms_test.json"
-_EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+TRAIN, TEST = "transforms_train.json", "transforms_test.json"
+EXTENSIONS = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 _STRAIGHT = ("OPENCV", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
@@ -64,10 +64,10 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
 
 def _load(file: Path, options: ImageOptions) -> Dataset:
     data, frames = _read(file)
-    test = file.with_name(_TEST)
+    test = file.with_name(TEST)
     listed = [(data, frame, f"{file}: frames[{k}]") for k, frame in enumerate(frames)]
     tests = [(data, frame, f"{file}: test_frames[{k}]") for k, frame in enumerate(_frames(data, "test_frames", file))]
-    if file.name == _TRAIN and test.is_file():
+    if file.name == TRAIN and test.is_file():
         more, frames = _read(test)
         tests += [(more, frame, f"{test}: frames[{k}]") for k, frame in enumerate(frames)]
         data = {**more, **data}
@@ -86,7 +86,7 @@ def _load(file: Path, options: ImageOptions) -> Dataset:
     sizes: dict[str, tuple[int, int]] = {}
     for (top, frame, where), camera in zip(listed, cameras):
         name = _name(frame, where)
-        image = found.path(name, where, _EXTENSIONS)
+        image = found.path(name, where, EXTENSIONS)
         if image is None:
             continue
         lens = _lens({**top, **frame}, image, sizes, camera, where)

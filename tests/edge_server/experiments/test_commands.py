@@ -85,6 +85,11 @@ def test_a_channel_is_a_preset_a_scenario_or_a_section_alone(tmp_path: Path):
     (tmp_path / "poses.tum").write_bytes(b"")
     for data in (tmp_path, None):  # data beside the scenario need no folder
         assert Folders(data).files_of(recorded) == named
+    listed = [tmp_path / name for name in ("transforms_train.json", "transforms_test.json", "a.png", "b.png")]
+    for file, image in zip(listed, ("a", "./b.png")):
+        file.write_text(json.dumps({"frames": [{"file_path": image}]}))
+        (tmp_path / image).with_suffix(".png").write_bytes(b"")
+    assert set(listed) < set(Folders().files_of(replace(recorded, source={"data": listed[0].name})))
     assert read_channel(str(tmp_path / "whole.yaml"))[0] == found
     (tmp_path / "wrong.yaml").write_text("{discipline: sometimes}")
     for text in (str(tmp_path / "wrong.yaml"), str(tmp_path / "none.yaml"), "sms"):
