@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edge_server.fidelity.scorer import SELECTED
-from edge_server.report.report_constants import LITTLE_DB, WORTH_SAYING
+from edge_server.report.report_constants import FINAL_PART, LITTLE_DB, WORTH_SAYING
 from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = Mapping[str, Any]
@@ -32,14 +32,14 @@ def _shown(report: Report) -> str:
             f"The newest held-out frame read {db:.1f} dB, all {so_far['frames']} so far {so_far['all_psnr_db']:.1f} dB"
         )
     elif db is None:
-        return "How good the picture was is not known: nothing was scored in the last fifth of the run."
+        return f"How good the picture was is not known: nothing was scored in the {FINAL_PART} of the run."
     elif report["kind"] == "fit":
         text = f"After {report['seconds']:.0f} s of fitting, {_views(report)} read {db:.1f} dB"
         if final["psnr_refined_db"] is not None:
             text += f", {final['psnr_refined_db']:.1f} dB at refined poses and exposures"
     else:
         text = (
-            f"In the last fifth of the run, {'what was shown' if found is shown else 'publications'} read {db:.1f} dB"
+            f"In the {FINAL_PART} of the run, {'what was shown' if found is shown else 'publications'} read {db:.1f} dB"
         )
         text += f" on {NOTHING_HELD_OUT}" if SELECTED in fidelity["scored_on"] else ""
         if found["psnr_moving_db"] is not None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 # --- what is said of a run (run_statistics, conclusion) ---
-FINAL_SHARE = 0.2  # last share of a run: ``final`` and ``shown`` are means over it
+# Last share of a run, and what people call it: ``final`` and ``shown`` are means over it.
+FINAL_SHARE, FINAL_PART = 0.2, "last fifth"
 LITTLE_DB = 3.0  # above an image of one mean color: a field that gains less shows a blur, whatever the age
 # Share of frames or updates: below that, what was lost or left out is not worth a clause of the conclusion.
 WORTH_SAYING = 0.05

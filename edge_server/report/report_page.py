@@ -10,6 +10,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, Undefined
 
 from edge_server.fidelity.scorer import SELECTED
+from edge_server.report.report_constants import FINAL_PART
 from freshfield.scenario import NOTHING_HELD_OUT
 
 TEMPLATE = "report.html.j2"
@@ -28,7 +29,12 @@ def render_page(report: Mapping[str, Any], figures: Mapping[str, Path]) -> str:
 
     template = environment.get_template(TEMPLATE)
     return template.render(
-        r=report, figures=images, selected=SELECTED, nothing_held_out=NOTHING_HELD_OUT, why_whole=why_whole
+        r=report,
+        figures=images,
+        selected=SELECTED,
+        nothing_held_out=NOTHING_HELD_OUT,
+        final_part=FINAL_PART,
+        why_whole=why_whole,
     )
 
 

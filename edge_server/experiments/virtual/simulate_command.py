@@ -33,6 +33,7 @@ from edge_server.fidelity.scorer import SHOWN, Score, Scorer
 from edge_server.live.output.journal import shown_line
 from edge_server.live.state import Publication
 from edge_server.machine import run_facts, versions
+from edge_server.report.report_constants import FINAL_PART, FINAL_SHARE
 from edge_server.scheduler import parse_policy, short_name
 from edge_server.scheduler.learned.decision_record import DecisionWriter
 from edge_server.settings import (
@@ -161,8 +162,9 @@ def summary(scenario: Scenario, deployment: VirtualDeployment, seconds: float) -
     seconds_to_1_db: the first of them from which on a second's mean is within 1 dB of the last fifth's.
     """
     publications = deployment.publications
-    shown = [s for s in deployment.shown if s.published_ns >= 0.8e9 * seconds]
-    late = [p for p in publications if p.t_s >= 0.8 * seconds]
+    from_s = (1.0 - FINAL_SHARE) * seconds
+    shown = [s for s in deployment.shown if s.published_ns >= 1e9 * from_s]
+    late = [p for p in publications if p.t_s >= from_s]
     curve, end_db = shown_curve(deployment.shown), mean_or_none([s.psnr_db for s in shown])
     return {
         "scenario": scenario.name,
@@ -263,7 +265,7 @@ def show(found: dict[str, Any]) -> str:
         f"{short_name(found['policy'])}{value}",
         f"  updates     {found['updates']} of {found['steps']} steps, {cost_text}",
         f"  views       {number(found['views'], 1)} an update",
-        "  last fifth  " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["last_fifth"].items()),
+        f"  {FINAL_PART}  " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["last_fifth"].items()),
         "  shown       " + ", ".join(f"{k} {number(v, 3)}" for k, v in found["shown"].items()),
         *(["  since 4 s   " + ", ".join(f"{k} {number(v, 3)}" for k, v in now_and_all.items())] if now_and_all else []),
         f"  seconds until within 1 dB of that: {number(found['seconds_to_1_db'], 1)}",
