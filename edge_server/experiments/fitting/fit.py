@@ -123,7 +123,7 @@ class Fit(ViewedField):
     def _run_slice(self, until_s: float, progress: Callable[[UpdateRow], None] | None) -> bool:
         """Fit until then, and score. Returns False if Ctrl-C was pressed meanwhile: the parameters, those of the last
         step, are scored all the same."""
-        began_s = time.perf_counter()
+        began_s, began_at = time.perf_counter(), getattr(self.field, "step", 0)
         report: FitReport | None = None
         with suppress(KeyboardInterrupt):
             report = self.field.fit(self.data.training, Budget(seconds=until_s - self.spent_s))
@@ -131,7 +131,9 @@ class Fit(ViewedField):
         usage = self._load_meter.row(0.0)
         score, self._shown = score_views(self.field, self._scored_views, self._scorer)
         self.spent_s += slice_s
-        self.spent_steps += report.steps if report else 0
+        # After Ctrl-C there is no report, but our fields count their steps themselves.
+        steps = report.steps if report else max(getattr(self.field, "step", 0) - began_at, 0)
+        self.spent_steps += steps
         self._processes.append(usage | {"t_s": round(self.spent_s, 3)})
         self.outside = outside_cores(usage)
         self._load_meter.row(0.0)  # the evaluation is not measured
@@ -145,7 +147,7 @@ class Fit(ViewedField):
             ssim_refined=score.ssim_refined,
             selected=len(self.data.training),
             update_ms=slice_s * 1e3,
-            steps=self.spent_steps if report else None,
+            steps=self.spent_steps if report or steps else None,
             loss=report.loss if report else None,
             scored_on=f"{len(self.data.held_out)} views" if self.data.held_out else SELECTED,
         )

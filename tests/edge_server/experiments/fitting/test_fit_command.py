@@ -16,6 +16,7 @@ from edge_server.experiments.scenes.multiview_still import WHITE, mean_baselines
 from edge_server.export import ExportError
 from edge_server.fidelity.images import BLACK
 from edge_server.fields import checkpoint
+from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.report.build_report import build_report
 from freshfield.geometry import look_at
 from tests.edge_server.experiments.sets import SMALL_WORDS, write_photos
@@ -50,6 +51,19 @@ def test_it_learns_goes_on_and_leaves_report_pictures_and_checkpoint(tmp_path, c
     assert "give more --seconds" in capsys.readouterr().err
     assert fit(tmp_path / "set", out, "--seconds", "5", "--resume", "--holdout", "3") == 2
     assert "has learned" in (said := capsys.readouterr().err) and "give the --holdout that it began with" in said
+
+
+def test_ctrl_c_amid_a_slice_keeps_its_steps(tmp_path, capsys, monkeypatch):
+    def end_third(budget, end=StepBudget.end_step):
+        end(budget)
+        if budget.steps == 3:
+            raise KeyboardInterrupt
+
+    write_photos(tmp_path / "set", 5)
+    monkeypatch.setattr(StepBudget, "end_step", end_third)
+    assert fit(tmp_path / "set", tmp_path / "out", "--seconds", "5") == 0
+    assert "stopped early" in (said := capsys.readouterr().out) and "3 steps" in said
+    assert checkpoint.load(tmp_path / "out" / "field")[1]["steps"] == 3
 
 
 def test_a_scene_of_ours_is_fitted_by_its_name(tmp_path, capsys, monkeypatch):
