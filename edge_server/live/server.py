@@ -197,7 +197,6 @@ class EdgeServer:
         ended_s = earlier.uptime_s or 0.0
         self.state.events.extend((round(event.t_s - ended_s, 3), event.what) for event in earlier.events)
         log.info("%s", self.state.chosen)
-        write_json(options.out / "frontier.json", msgspec.to_builtins(self.frontier))
         self.journal = Journal(options.out, self.status)
 
     # --- running ----------------------------------------------------------------------------------
@@ -228,6 +227,7 @@ class EdgeServer:
                 serve_metrics(
                     self.state, self.ingest, self.options.page_host, self.options.metrics_port, self.options.transport
                 )
+            write_json(self.options.out / "frontier.json", msgspec.to_builtins(self.frontier))
             self.journal.begin()
             served = True
             self.scoring.start()
@@ -445,8 +445,8 @@ class EdgeServer:
                 self.journal.close()
 
     def _leave_no_trace(self) -> None:
-        """Close the files of a start that served nothing: edge.json, and with it the report, stay those of an earlier
-        run. A ledger without a frame goes."""
+        """Close the files of a start that served nothing: edge.json and frontier.json, and with them the report, stay
+        those of an earlier run. A ledger without a frame goes."""
         try:
             self._close_records()
             if all(each.event == "closed" for each in LedgerReader(self.ledger.path)):

@@ -293,8 +293,8 @@ def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):
     refused(TransportError, r"cannot listen: gRPC on 0\.0\.0\.0", server(record=tmp_path / "s.mcap").run)
     page = ServerOptions("127.0.0.1:0", tmp_path / "o", open_page=MagicMock(side_effect=OSError("taken")))
     refused(OSError, "taken", EdgeServer(made, read_config(made), page).run)
-    # A start that fails is no process that was killed, takes no name, and leaves an earlier run's status.
-    assert not read_all(tmp_path / "o") and not [*tmp_path.glob("*.mcap"), *tmp_path.glob("o/edge.json")]
+    # A start that fails is no process that was killed, takes no name, and leaves an earlier run's status and frontier.
+    assert not read_all(tmp_path / "o") and not [*tmp_path.glob("*.mcap"), *tmp_path.glob("o/*.json")]
     named = server(transport=Transport(insecure=True))._warnings()
     assert [words.split(" on ")[0] for words in named] == ["gRPC", "page", "metrics"]
 
