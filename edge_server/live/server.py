@@ -150,8 +150,13 @@ class EdgeServer:
             log.info("recording to %s", self.recorder.file)
         self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)  # once nothing above can fail any more
         earlier = _earlier(options.out / "edge.json")
-        counted = earlier.updates or UpdateCounts()  # of frames, as the ledgers, which go on
+        counted = earlier.updates or UpdateCounts()  # the run's, as its ledgers, which go on
         self._earlier_undecodable, self._earlier_shed = counted.undecodable or 0, counted.shed or 0
+        self._counts.refused = dict(counted.refused)
+        # Where the field begins anew, or from a checkpoint that a kill has outlived, so do numbers and counts.
+        short = max(0, int(about.get("without_step", 0)))
+        self._earlier_updates = max(0, counted.count - self.updater.number)
+        self._earlier_short = max(0, (counted.without_step or 0) - short)
         self.ingest = Ingest(
             self.clock,
             self.buffer,
@@ -176,7 +181,7 @@ class EdgeServer:
             self._write_checkpoint,
             lambda what: self.state.note(what),
         )
-        self.loop.without_step = max(0, int(about.get("without_step", 0)))  # of all updates: ``number`` counts on
+        self.loop.without_step = short
         self.state = EdgeState(
             scenario=scenario.name,
             policies=self.policies.offered,
@@ -283,7 +288,6 @@ class EdgeServer:
         if counts.first_ms is None:
             counts.first_ms = publication.t_s * 1e3
         self._update_ms.append(publication.update_ms)
-        counts.without_step = self.loop.without_step
         for camera in publication.refused:
             counts.refused[camera] = counts.refused.get(camera, 0) + 1
         self.state.publish(publication, renderer)
@@ -335,7 +339,7 @@ class EdgeServer:
         if not self._snapshot_lock.acquire(blocking=False):
             raise RuntimeError("another one is being written")
         try:
-            path = self.options.out / f"snapshot-{self.updater.number:06d}.npz"
+            path = self.options.out / f"snapshot-{self._earlier_updates + self.updater.number:06d}.npz"
             return self.loop.request_checkpoint(path).result(tuned.SNAPSHOT_TIMEOUT_S)
         except TimeoutError:
             raise RuntimeError(f"the update in progress took over {tuned.SNAPSHOT_TIMEOUT_S:g} s") from None
@@ -399,9 +403,10 @@ class EdgeServer:
             "updates": msgspec.to_builtins(
                 msgspec.structs.replace(
                     self._counts,
-                    count=self.updater.number,
+                    count=self._earlier_updates + self.updater.number,
                     ms_p50=percentile(self._update_ms, 50),
                     ms_p95=percentile(self._update_ms, 95),
+                    without_step=self._earlier_short + self.loop.without_step,
                     undecodable=self._earlier_undecodable + self.updater.decoder.undecodable + self.scoring.undecodable,
                     shed=self._earlier_shed + self.buffer.shed,
                 )

@@ -46,10 +46,10 @@ def assemble(files: RunFiles) -> dict[str, Any]:
     notes += edge.troubles
     accounting = account_frames(files.out)
     seconds = max(edge.seconds or edge.uptime_s or 0.0, series[-1].t_s if series else 0.0)
-    counted = updates(series, edge.updates or UpdateCounts())
+    counted = updates(series, edge.updates or UpdateCounts(), restarted=bool(files.restarts_s))
     first_ms, ended_s = None, seconds
     if edge.kind == "live":
-        first_ms = 1e3 * series[0].t_s if series and files.restarts_s else counted["first_ms"]
+        first_ms = counted["first_ms"]
         ended_s = max((rows[-1].t_s for rows in (files.ages, series) if rows), default=seconds)
     late_s = last_share_s(first_ms, ended_s)
     report = {

@@ -52,17 +52,19 @@ def depth(status: DepthStatus, rows: Sequence[AgesRow]) -> dict[str, Any]:
     }
 
 
-def updates(series: Sequence[UpdateRow], edge: UpdateCounts) -> dict[str, Any]:
+def updates(series: Sequence[UpdateRow], edge: UpdateCounts, restarted: bool = False) -> dict[str, Any]:
     """Number and duration of updates.
 
     series: rows of updates, used where the edge has no count; not every update has a row.
-    edge: the edge's own counts.
+    edge: the edge's own counts. restarted: its times are those of its last process alone, so that those of rows count.
     Returns {count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication,
     undecodable, shed: frames left out for lack of time, without_step: updates without time for an optimizer
     step, refused: {camera: how often the field left its image out}}.
     """
     spent = [row.update_ms for row in series if row.update_ms is not None]
     p50, p95 = np.percentile(spent, [50, 95]).tolist() if spent else (None, None)
+    if restarted and series:
+        edge = msgspec.structs.replace(edge, ms_p50=p50, ms_p95=p95, first_ms=None)
     refused = Counter(camera for row in series for camera in row.refused)
     return {
         "count": max(len(series), edge.count),

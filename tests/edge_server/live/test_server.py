@@ -154,8 +154,8 @@ def test_a_run_from_first_frame_to_files(serve, tmp_path):
     assert fresh.updater.number == 0 and not fresh.state.started
     (event,) = fresh.status()["events"]  # of the first process, before this one
     assert event["what"] == "an operator reset the field" and -60 < event["t_s"] <= 0
-    counted = fresh.status()["updates"]  # of frames: as in the ledgers, those of the first process count
-    assert counted["shed"] >= 7
+    counted = fresh.status()["updates"]  # those of the first process, as in the ledgers, too
+    assert counted["shed"] >= 7 and counted["without_step"] >= 1000 and counted["count"] >= len(series)
     kept = [json.loads(line) for line in (out / "series.jsonl").read_text().splitlines()]
     assert kept[: len(series)] == series  # what the first process wrote is still there
 

@@ -110,6 +110,8 @@ def test_updates_are_counted_as_the_edge_counted_them(run):
     rows = [UpdateRow(t_s=0.5 + k, update_ms=60.0 + k) for k in range(3)]
     alone = updates(rows, UpdateCounts())
     assert (alone["count"], alone["ms_p50"], alone["first_ms"]) == (3, 61.0, 500.0)
+    again = updates(rows, UpdateCounts(9, 700.0, 800.0, 10.0), restarted=True)  # these times: of the last process alone
+    assert (again["count"], again["ms_p50"], again["first_ms"]) == (9, 61.0, 500.0)
     counted = updates(rows, UpdateCounts(without_step=40, refused={"cam01": 3}))  # also of updates without a row
     assert counted["without_step"] == 40 and counted["refused"] == {"cam01": 3}
 
