@@ -17,6 +17,8 @@ def conclusion(report: Report) -> list[str]:
     if report["kind"] == "fit":
         return [sentence for sentence in (_shown(report), _fitted(report)) if sentence]
     if not report["updates"]["count"]:
+        if report["scenario"] is None:  # ledgers of several machines, joined in a folder of their own
+            return ["What was shown is not known: the edge's own files are not in this folder.", *_delivery(report)]
         return ["Nothing was shown: the field was never updated.", *_delivery(report)]
     return [sentence for sentence in (_shown(report), _age(report), _limit(report)) if sentence]
 

@@ -177,7 +177,10 @@ def test_a_killed_run_is_reported_with_notes_on_what_is_torn(tmp_path, capsys):
     report, page = page_of(tmp_path / "empty")
     assert report["updates"]["count"] == 0 and report["frames"]["captured"] == 0
     assert report["age_ms"] == {"mean": None, "p50": None, "p95": None, "by_camera": {}}
-    assert "The field was never updated" in page and "No ledgers" in page
+    assert "Not known: edge.json is not in this folder" in page and "No ledgers" in page
+    assert "What was shown is not known" in page and "never updated" not in page
+    (tmp_path / "empty" / "edge.json").write_text('{"scenario": "room"}')
+    assert "Nothing was shown" in (page := page_of(tmp_path / "empty")[1]) and "The field was never updated" in page
     assert not draw_ages(report, read_run_files(tmp_path / "empty"), tmp_path / "none.png")
 
 
