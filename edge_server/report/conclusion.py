@@ -93,13 +93,14 @@ def _limit(report: Report) -> str:
     shown, flat, so_far = fidelity["shown"], fidelity["baseline"]["mean_color_db"], fidelity["so_far"]
     # Where held-out cameras move, `shown` is scored at given poses, which may be wrong where the picture is not.
     still = shown["psnr_still_db"] if so_far is None else so_far["all_psnr_db"]
-    what, few = "What stands still", "too few cameras, poses that do not fit, or too short a run"
+    what, few = "What stands still", "too few cameras, poses that do not fit, or too short a run for this machine"
     if still is None and SELECTED in fidelity["scored_on"]:
         what, still = "What is shown", fidelity["final"]["psnr_db"]
-        few = "poses that do not fit, or too short a run"  # few cameras do not blur the views that were learned from
+        few = "poses that do not fit, or too short a run for this machine"  # few cameras do not blur the views that were learned from
     lost = "; ".join(_delivery(report)).rstrip(".")
     if still is not None and flat is not None and still < flat + LITTLE_DB:
-        return f"{what} is little better than one mean color: {few}{f'; {lost}' if lost else ''}."
+        better = "little better" if still > flat else "no better"
+        return f"{what} is {better} than one mean color: {few}{f'; {lost}' if lost else ''}."
     age = {name: ms or 0.0 for name, ms in shown["age_ms"].items()}
     if not any(age.values()):
         return f"{lost[:1].upper()}{lost[1:]}." if lost else ""
