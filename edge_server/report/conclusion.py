@@ -96,7 +96,8 @@ def _limit(report: Report) -> str:
     what, few = "What stands still", "too few cameras, poses that do not fit, or too short a run for this machine"
     if still is None and SELECTED in fidelity["scored_on"]:
         what, still = "What is shown", fidelity["final"]["psnr_db"]
-        few = "poses that do not fit, or too short a run for this machine"  # few cameras do not blur the views that were learned from
+        # Few cameras do not blur the views that were learned from.
+        few = "poses that do not fit, or too short a run for this machine"
     lost = "; ".join(_delivery(report)).rstrip(".")
     if still is not None and flat is not None and still < flat + LITTLE_DB:
         better = "little better" if still > flat else "no better"

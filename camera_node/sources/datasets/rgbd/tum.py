@@ -16,7 +16,6 @@ import numpy as np
 
 from camera_node.node_constants import MAX_STAMP_S
 from camera_node.pose.pairing import PoseGapError
-from camera_node.pose.providers import PoseGapError, read_tum
 from camera_node.pose.trajectory_file import read_tum
 from camera_node.sources import source_constants as tuned
 from camera_node.sources.datasets.lens import Lens
