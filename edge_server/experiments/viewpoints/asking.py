@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.viewpoints import capture_constants as tuned
 from edge_server.experiments.viewpoints.reconstructions import identity, sprites, taste_score, varied_plans
 from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.progress import ProgressLine
-from edge_server.viewpoints import viewpoint_constants as tuned
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.experts import SimulatedExpert
 from edge_server.viewpoints.features import StepFeatures

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.experiments.viewpoints import capture_constants as tuned
 from edge_server.experiments.viewpoints.stage import Stage
 from edge_server.fidelity.images import to_bytes, to_unit
 from edge_server.fields import Field
-from edge_server.viewpoints import viewpoint_constants as tuned
 from edge_server.viewpoints.candidates import Candidates
 from edge_server.viewpoints.capture_planner import Budget, Plan, plan_capture
 from edge_server.viewpoints.experts import judge

@@ -17,6 +17,12 @@ from edge_server.embed import EmbeddingError, make_embedder
 from edge_server.embed.settings import EmbeddingConfig
 from edge_server.experiments.scenes.multiview_still import WHITE, known_options, score_views
 from edge_server.experiments.scenes.recorded import load_recorded
+from edge_server.experiments.viewpoints.capture_constants import (
+    HELD_OUT_VIEWPOINTS,
+    NEAR_OF_RADIUS,
+    PLAN_CANDIDATES,
+    STAGE_EMBEDDING_DIM,
+)
 from edge_server.experiments.virtual.from_scenario import exact_scene
 from edge_server.fidelity.images import BLACK, Color, to_bytes, to_unit
 from edge_server.fidelity.scorer import Score, Scorer
@@ -24,12 +30,6 @@ from edge_server.fields import Budget, Field, View
 from edge_server.fields.registry import make_field
 from edge_server.viewpoints.candidates import Candidates, ViewpointError, from_poses, half_hemisphere
 from edge_server.viewpoints.policy import Embed
-from edge_server.viewpoints.viewpoint_constants import (
-    HELD_OUT_VIEWPOINTS,
-    NEAR_OF_RADIUS,
-    PLAN_CANDIDATES,
-    STAGE_EMBEDDING_DIM,
-)
 from freshfield.scenario import Scenario, load
 
 _BETWEEN = 0.25  # offset of ``half_hemisphere``

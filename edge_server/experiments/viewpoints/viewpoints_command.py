@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
+from edge_server.experiments.viewpoints import capture_constants as tuned
 from edge_server.experiments.viewpoints.asking import ANSWERS, compare
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
-from edge_server.viewpoints import viewpoint_constants as tuned
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.capture_planner import Budget, plan_capture
 from edge_server.viewpoints.experts import TASTES
