@@ -15,7 +15,7 @@ from edge_server.fields.common.camera_rows import camera_rows
 from edge_server.fields.field_constants import BETA1
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, age_corrections
-from edge_server.fields.splat.kernels.rasterize import Targets
+from edge_server.fields.splat.kernels.rasterize import Target
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.registry import CaptureState
@@ -36,22 +36,15 @@ def information(
     raster, still = RasterBuffers(snapshot.pool), np.zeros(width, np.float32)
     rule = AdamParameters(still, age_corrections(), np.float32(1.0))
     for pose, lens in zip(poses, lenses):
-        cams, pixels = camera_rows([pose], [lens], snapshot.box), lens.width * lens.height
-        raster.project_and_bin(cams, gaussians)
+        camera, size = camera_rows([pose], [lens], snapshot.box), (lens.height, lens.width, 3)
+        raster.project_and_bin(camera, gaussians)
         rng, gradients = np.random.default_rng(0), np.empty((images, count, width), np.float32)
         for gradient in gradients:
-            targets = Targets(
-                first=np.array([0, pixels]),
-                size=np.array([[lens.width, lens.height]]),
-                pixels=rng.integers(2, size=(pixels, 3), dtype=np.uint8) * np.uint8(255),
-                weight=np.zeros(0, np.float32),
-                behind=np.zeros((0, 3), np.float32),
-                background=snapshot.background,
-            )
-            raster.train(targets, 0)
+            image = rng.integers(2, size=size, dtype=np.uint8) * np.uint8(255)
+            raster.train(Target(image, np.zeros((0, 0), np.float32), snapshot.background))
             sums = (np.zeros(count, np.float32) for _ in range(3))
             first, second = np.zeros((2, count, width), np.float32)
-            raster.step(cams, gaussians, OptimizerState(first, second, np.zeros(count, np.int32), *sums), rule)
+            raster.step(camera, gaussians, OptimizerState(first, second, np.zeros(count, np.int32), *sums), rule)
             gradient[:] = first / (1.0 - BETA1)  # Adam's first moment after one step
         yield gradients.var(axis=0, ddof=1)
 

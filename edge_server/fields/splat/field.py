@@ -31,7 +31,7 @@ from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, SH_COLUMNS, TILE
-from edge_server.fields.splat.kernels.rasterize import LOSSES, Targets
+from edge_server.fields.splat.kernels.rasterize import LOSSES, Target
 from edge_server.fields.splat.seeding import seed_gaussians
 from edge_server.fields.splat.settings import SplatSettings
 from edge_server.fields.splat.snapshot import SplatSnapshot
@@ -91,8 +91,8 @@ class StillField(SteppedField[SplatSnapshot]):
         with self._lock:
             square, pixels, gaussians = 0.0, 0, self.cloud.gaussians()
             for view in self._asked:
-                self._raster.project_and_bin(self._cams[[view]], gaussians)
-                losses = self._compare(view)
+                self._raster.project_and_bin(self._camera(view), gaussians)
+                losses = self._raster.train(self._target(view))
                 square, pixels = square + float(losses[:, 0].sum()), pixels + TILE * TILE * len(losses)
         return square / (3 * max(pixels, 1))
 
@@ -162,14 +162,6 @@ class StillField(SteppedField[SplatSnapshot]):
             )
             self._data: Views = intake.data
             # All of them, where every weight is 0.
-            self._targets = Targets(
-                self._data.first,
-                self._data.size,
-                self._data.pixels,
-                self._data.weight,
-                np.zeros((0, 3), np.float32),
-                self.view_store.background(),
-            )
             self._asked = supervising_views(self._data) or list(range(len(views)))
             self._views, self._epoch = tuple(views), -1
         if len(self.cloud) == 0:
@@ -196,10 +188,10 @@ class StillField(SteppedField[SplatSnapshot]):
         gradients were not finite.
         """
         view = self._next_view()
-        camera, cloud, raster = self._cams[[view]], self.cloud, self._raster
+        camera, cloud, raster = self._camera(view), self.cloud, self._raster
         gaussians = cloud.gaussians()
         raster.project_and_bin(camera, gaussians)
-        losses = self._compare(view)
+        losses = raster.train(self._target(view))
         dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress), self._rigid)
         self._learn_camera(view, losses)
         if self.settings.planar:
@@ -213,12 +205,21 @@ class StillField(SteppedField[SplatSnapshot]):
         if grow:
             self._grow_if_due()
         pixels = TILE * TILE * len(losses)
-        pairs = min(int(raster.lists.needed[0]), raster.lists.pair.shape[1])
+        pairs = min(int(raster.lists.needed[0]), raster.lists.pair.size)
         return square / (3 * pixels), pixels, pairs, int(broken) + dropped
 
-    def _compare(self, view: int) -> NDArray[np.float64]:
-        """Compare a view with what its camera sees, and find the gradients. Returns ``losses``, see ``train_tiles``."""
-        return self._raster.train(self._targets, view)
+    def _camera(self, view: int) -> NDArray[np.float32]:
+        """The row (1, CAMERA) of a view's camera, from where it is learned now."""
+        return self._cams[[view]]
+
+    def _target(self, view: int) -> Target:
+        """A view as what to learn."""
+        return Target(*self._pixels_of(view), self.view_store.background())
+
+    def _pixels_of(self, view: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+        """The image of a view, (H, W, 3 or 4), and its weights, see ``Target``."""
+        (w, h), first = self._data.size[view], self._data.first[view]
+        return self._data.pixels[first : first + w * h].reshape(h, w, -1), self._weight_of(view)
 
     def adam_parameters(self, progress: float) -> AdamParameters:
         """Parameters of an optimizer step at ``progress``, in [0, 1], of a fit."""
@@ -254,25 +255,23 @@ class StillField(SteppedField[SplatSnapshot]):
         cloud, box = self.cloud, self.view_store.box
         assert box is not None
         data = self._data
-        slots = [k for k in range(len(data.size)) if (self._weight_of(k) == 0).any()]
+        raster, shows = self._render_raster, np.zeros(len(cloud), np.bool_)
+        for k in range(len(data.size)):
+            if (without := self._weight_of(k) == 0).any():
+                raster.project_and_bin(self._camera(k), cloud.gaussians(), differentiate=False)
+                shows |= raster.reaching(len(cloud), without)
         given = {view.camera for view in self._views}
-        others = [view for view in self.view_store.views if view.camera not in given]
-        if not slots and not others:
-            return
-        cams = np.concatenate(
-            [self._cams[slots], camera_rows([self._pose_of(v) for v in others], [v.intrinsics for v in others], box)]
-        )
-        raster, count = self._render_raster, len(cloud)
-        raster.project_and_bin(cams, cloud.gaussians(), differentiate=False)
-        shows = (raster.lists.own_count[len(slots) : len(cams), :count] > 0).any(axis=0)
-        for b, k in enumerate(slots):
-            shows |= raster.reaching(b, count, self._weight_of(k) == 0)
+        for view in self.view_store.views:
+            if view.camera not in given:
+                camera = camera_rows([self._pose_of(view)], [view.intrinsics], box)
+                raster.project_and_bin(camera, cloud.gaussians(), differentiate=False)
+                shows |= raster.lists.own_count[: len(cloud)] > 0
         cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
 
     def _weight_of(self, view: int) -> NDArray[np.float32]:
-        """How much each pixel of a view counts, (H, W); (0,) where all count in full."""
+        """How much each pixel of a view counts, (H, W); (0, 0) where all count in full."""
         (w, h), first, weight = self._data.size[view], self._data.first[view], self._data.weight
-        return weight[first : first + w * h].reshape(h, w) if weight.size else weight
+        return weight[first : first + w * h].reshape(h, w) if weight.size else weight.reshape(0, 0)
 
     def _seed(self) -> None:
         """Seed the first Gaussians from the current views."""

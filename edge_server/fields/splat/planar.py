@@ -50,15 +50,15 @@ def blend_planes(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """The Gaussians' planes, blended as their colors are: normal (H, W, 3), distance (H, W) and opacity (H, W).
 
-    raster: buffers whose last ``project_and_bin`` had this camera first. camera: float32 (CAMERA,), its row.
+    raster: buffers whose last ``project_and_bin`` had this camera. camera: float32 (CAMERA,), its row.
     """
     shape = int(camera[SIZE + 1]), int(camera[SIZE])
-    planes = raster.projected[:1].copy()
-    mine, shown = gaussian_planes(gaussians, camera), planes[0, : len(gaussians.params)]
+    planes = raster.projected.copy()
+    mine, shown = gaussian_planes(gaussians, camera), planes[: len(gaussians.params)]
     shown[:, RED:DEPTH], shown[:, DEPTH] = 0.5 + 0.5 * mine[:, :3], mine[:, 3]  # colors lie in [0, 1]
     color, depth, opacity = (np.zeros((*shape, *more), np.float32) for more in ((3,), (), ()))
     raster.pool.run(
-        render_tiles, raster.first._replace(projected=planes), np.zeros(3, np.float32), color, depth, opacity
+        render_tiles, raster.raster._replace(projected=planes), np.zeros(3, np.float32), color, depth, opacity
     )
     two, least = np.float32(2.0), np.float32(1e-3)
     return two * color - opacity[..., None], depth * np.maximum(opacity, least), opacity

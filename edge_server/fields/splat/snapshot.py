@@ -55,12 +55,12 @@ class SplatSnapshot:
         raster, _ = self._project(camera_to_world, intrinsics)
         color, depth = np.empty((h, w, 3), np.float32), np.empty((h, w), np.float32)
         opacity = np.empty((h, w), np.float32)
-        self.pool.run(render_tiles, raster.first, self.background, color, depth, opacity)
+        self.pool.run(render_tiles, raster.raster, self.background, color, depth, opacity)
         depth *= ray_lengths(intrinsics) * np.float32(self.box.radius_m)
         return Rendering(color, depth, opacity)
 
     def _project(self, pose: NDArray[np.float64], lens: Pinhole) -> tuple[RasterBuffers, NDArray[np.float32]]:
-        """Fresh buffers with the Gaussians that one camera sees, and that camera's rows."""
+        """Fresh buffers with the Gaussians that one camera sees, and that camera's row."""
         raster, cams = RasterBuffers(self.pool), camera_rows([pose], [lens], self.box)
         raster.project_and_bin(cams, self.gaussians, differentiate=False)
         return raster, cams

@@ -255,11 +255,10 @@ class PoseCorrections:
             c.rotation = _at_most(c.rotation - mean_rotation, self.most_rad)
             c.shift_m = _at_most(c.shift_m - mean_shift, self.most_m)
 
-    def descend(self, view: View, gradient: Array, normal: Array, pixel_m: float) -> list[str]:
+    def descend(self, view: View, gradient: Array, normal: Array, pixel_m: float) -> None:
         """A Gauss-Newton step for one camera, with the slopes of its image in place of the rendering's (inverse
         compositional, Baker and Matthews 2004): they are known beforehand, and do not vanish while the rendering is
-        blurred. Steps get short by themselves where poses are exact. Returns which views' corrections changed; none
-        where the gradient is not finite.
+        blurred. Steps get short by themselves where poses are exact. Nothing changes where the gradient is not finite.
 
         gradient: (6,), of a sum of squared errors by the camera's shift per meter and its rotation per radian, world
             axes.
@@ -267,7 +266,7 @@ class PoseCorrections:
         pixel_m: shift that moves what the camera sees by a pixel.
         """
         if not np.isfinite(gradient).all():
-            return []
+            return
         known = self._of(view)
         axes = known.given[:3, :3]  # a correction is too small to matter here
         local = np.concatenate([axes.T @ gradient[:3], axes.T @ gradient[3:]])
@@ -276,13 +275,11 @@ class PoseCorrections:
         step = np.clip(-0.5 * np.linalg.solve(damped, local), -farthest, farthest)
         step /= max(known.steps / self.full_steps, 1.0)
         known.steps += 1
-        changed = self._around(view.camera)
-        for name, share in changed.items():
+        for name, share in self._around(view.camera).items():
             other = self.known[name]
             axes = other.given[:3, :3]
             other.shift_m = _at_most(other.shift_m + share * (axes @ step[:3]), self.most_m)
             other.rotation = _at_most(other.rotation + share * (axes @ step[3:]), self.most_rad)
-        return list(changed)
 
     def _around(self, camera: str) -> dict[str, float]:
         """A view, those taken shortly before and after, and how much of its step they make too: the less, the more

@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import SEPARATOR, View
-from edge_server.fields.common.camera_rows import camera_rows
-from edge_server.fields.common.kernels.camera import CAMERA
 from edge_server.fields.common.supervision import CameraMemory, check_view
 from edge_server.fields.common.view_store import Arrays
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
@@ -28,7 +26,6 @@ from edge_server.fields.splat.carried_camera.reported_poses import OwnMotion, se
 from edge_server.fields.splat.carried_camera.scan_field import ScanField, Shown, aim_of
 from edge_server.fields.splat.carried_camera.seeds_on_depth import usable_depth
 from edge_server.fields.splat.densification import opacity
-from edge_server.fields.splat.kernels.rasterize import EXPOSURE, Targets
 
 # What a field that begins anew, which no depth was measured for, still knows of its cameras and their frames.
 _OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m")
@@ -100,21 +97,9 @@ class CarriedField(ScanField):
         self._forget_parameters()
 
     def _clear_views(self) -> None:
-        """Begin without keyframes. ``_targets`` holds their exposures; ``_compare`` adds the pixels of one."""
-        self._targets = Targets(
-            np.zeros(2, np.int64),
-            np.zeros((1, 2), np.int64),
-            np.zeros((0, 3), np.uint8),
-            np.zeros(0, np.float32),
-            np.zeros((0, 3), np.float32),
-            self.view_store.background(),
-            np.zeros((0, EXPOSURE), np.float32),
-            np.float32(tuned.DISSIMILARITY),
-        )
+        """Begin without keyframes."""
         self._views = ()
-        self._cams = np.zeros((0, CAMERA), np.float32)
         self._aims: list[tuple[NDArray[np.float64], float]] = []
-        self._index: dict[str, int] = {}
 
     def _take(self, reported: View) -> None:
         """Make a view a keyframe."""
@@ -343,16 +328,10 @@ class CarriedField(ScanField):
 
     def _append(self, view: View, aim: tuple[NDArray[np.float64], float]) -> None:
         """Learn from a view from now on. Its depth has served."""
-        box = self.view_store.box
-        assert box is not None
         view = replace(view, depth=None)
-        self._index[view.camera] = len(self._views)
         self._views = (*self._views, view)
         moved = None if view.weight is None else view.weight == 0.0
         self.view_store.memory[view.camera] = CameraMemory(view, moved)
-        self._cams = np.concatenate([self._cams, camera_rows([self._pose_of(view)], [view.intrinsics], box)])
-        row = self._exposures.row(view.camera)[None]
-        self._targets = self._targets._replace(exposure=np.concatenate([self._targets.exposure, row]))
         self._aims.append(aim)
 
     def _aim(self, view: View, shown: Shown | None) -> tuple[NDArray[np.float64], float]:
@@ -379,11 +358,8 @@ class CarriedField(ScanField):
         gone = self._views[k]
         self._views = (*self._views[:k], *self._views[k + 1 :])
         del self.view_store.memory[gone.camera], self._aims[k]
-        self._cams = np.delete(self._cams, k, axis=0)
-        self._targets = self._targets._replace(exposure=np.delete(self._targets.exposure, k, axis=0))
-        self._index = {view.camera: n for n, view in enumerate(self._views)}
         for name in list(self._poses.known)[: -tuned.KEPT_CORRECTIONS]:
-            if name not in self._index:
+            if name not in self.view_store.memory:
                 self._poses.forget(name)
                 self._exposures.known.pop(name, None)
 
@@ -392,18 +368,10 @@ class CarriedField(ScanField):
     def _next_view(self) -> int:
         return keyframe_choice.next_view(self._rng(7), len(self._views), len(self._seen), self.step - self._took_at)
 
-    def _compare(self, view: int) -> NDArray[np.float64]:
+    def _pixels_of(self, view: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         one = self._views[view]
-        h, w = one.image.shape[:2]
-        weight = np.zeros(0, np.float32) if one.weight is None else one.weight.reshape(-1)
-        target = self._targets._replace(
-            first=np.array([0, h * w]),
-            size=np.array([[w, h]]),
-            pixels=one.image.reshape(h * w, -1),
-            weight=weight,
-            exposure=self._targets.exposure[[view]] if self._rigid is not None else self._targets.exposure[:0],
-        )
-        return self._raster.train(target, 0)
+        weight = np.zeros((0, 0), np.float32) if one.weight is None else one.weight
+        return np.ascontiguousarray(one.image), weight
 
     def _most(self) -> int:
         return min(super()._most(), max(int(tuned.PER_PIXEL * self._pixels), tuned.LEAST))
@@ -427,7 +395,7 @@ class CarriedField(ScanField):
         return {**super()._counters(), **counts, "own_motion": self._own.meta(), "depths": depths}
 
     def _kept_depths(self) -> list[tuple[str, View]]:
-        return [(camera, view) for camera, view in self._depths.items() if view.camera in self._index]
+        return [(camera, view) for camera, view in self._depths.items() if view.camera in self.view_store.memory]
 
     def _arrays(self) -> Arrays:
         aims = [np.append(normal, pixel_m) for normal, pixel_m in self._aims]
@@ -449,7 +417,7 @@ class CarriedField(ScanField):
             self._append(view, (aim[:36].reshape(6, 6), float(aim[36])))
             self._seen[_carrier(view)] = view
         for k, (camera, name) in enumerate(meta["depths"].items()):
-            view = self._views[self._index[name]]
+            view = self.view_store.memory[name].view
             depth = np.array(state[f"depth_{k}"], np.float32)
             if depth.shape != view.image.shape[:2]:
                 raise ValueError(f"the state's depth_{k} must be {view.image.shape[:2]}, not {depth.shape}")

@@ -38,7 +38,7 @@ class Exposures:
         return np.stack([np.exp(logs), sum(share * bias for share, _, bias in parts)])
 
     def row(self, camera: str) -> NDArray[np.float32]:
-        """A row of ``Targets.exposure``. An error counts as it does in the image."""
+        """``Target.exposure``. An error counts as it does in the image."""
         gain, bias = self.of(camera)
         row = np.zeros(EXPOSURE, np.float32)
         row[:3], row[3:6], row[6] = gain, bias, np.mean(gain * gain)

@@ -31,7 +31,7 @@ from edge_server.fields.splat.densification import GaussianCloud, opacity
 from edge_server.fields.splat.field import StillField
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, age_corrections, clamp_gaussians
 from edge_server.fields.splat.kernels.project import BASE, COLOR, QUATERNION, SCALE, SH_COLUMNS
-from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_tiles
+from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, Target, render_tiles
 from edge_server.fields.splat.splat_constants import PRUNE_OPACITY
 from freshfield.geometry import Pinhole
 
@@ -74,17 +74,22 @@ class ScanField(StillField):
         assert box is not None
         if self.step >= tuned.EXPOSED_FROM:
             self._exposures.learn(now.camera, losses[:, LOSSES:].sum(axis=0).reshape(3, MOMENTS))
-            self._targets.exposure[view] = self._exposures.row(now.camera)
         gradient = -self._rigid / np.array([box.radius_m] * 3 + [1.0] * 3)
-        changed = self._poses.descend(now, gradient, *self._aims[view])
+        self._poses.descend(now, gradient, *self._aims[view])
         if self.step % tuned.GAUGE_EVERY == 0:
             self._exposures.center()
             self._poses.take_back(tuned.GAUGE_SHARE)
-            self._targets.exposure[:] = [self._exposures.row(v.camera) for v in self._views]
-            changed = list(self._index)
-        places = [self._index[name] for name in changed if name in self._index]
-        moved = [self._views[k] for k in places]
-        self._cams[places] = camera_rows([self._pose_of(v) for v in moved], [v.intrinsics for v in moved], box)
+
+    def _camera(self, view: int) -> NDArray[np.float32]:
+        one, box = self._views[view], self.view_store.box
+        assert box is not None
+        return camera_rows([self._pose_of(one)], [one.intrinsics], box)
+
+    def _target(self, view: int) -> Target:
+        target = super()._target(view)._replace(dissimilarity=np.float32(tuned.DISSIMILARITY))
+        if self._rigid is None:
+            return target
+        return target._replace(exposure=self._exposures.row(self._views[view].camera))
 
     # --- what StillField asks for -------------------------------------------------------------
 
@@ -108,15 +113,10 @@ class ScanField(StillField):
         views = [replace(view, depth=usable_depth(view.depth)) for view in views]
         super()._ingest(views)
         self._rule = None
-        self._targets = self._targets._replace(dissimilarity=np.float32(tuned.DISSIMILARITY))
-        if self._rigid is None:
-            return
-        assert self.view_store.box is not None
-        seen_m = self._seen_m or self.view_store.box.distance_m
-        self._aims = [aim_of(v, seen_m) for v in views]
-        self._index = {v.camera: k for k, v in enumerate(views)}
-        rows = [self._exposures.row(v.camera) for v in views]
-        self._targets = self._targets._replace(exposure=np.stack(rows))
+        if self._rigid is not None:
+            assert self.view_store.box is not None
+            seen_m = self._seen_m or self.view_store.box.distance_m
+            self._aims = [aim_of(v, seen_m) for v in views]
 
     def adam_parameters(self, progress: float) -> AdamParameters:
         if self._rule is None:
@@ -289,7 +289,7 @@ class ScanField(StillField):
         if len(self.cloud):
             raster, pose = self._render_raster, self._pose_of(view) if pose is None else pose
             raster.project_and_bin(camera_rows([pose], [lens], box), self.cloud.gaussians(), False)
-            self.pool.run(render_tiles, raster.first, self.view_store.background(), color, depth, alpha)
+            self.pool.run(render_tiles, raster.raster, self.view_store.background(), color, depth, alpha)
         return Shown(color, depth * np.float32(box.radius_m), alpha)
 
     def _as_rendered(self, view: View) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -17,17 +17,17 @@ RADIX = 1 << RADIX_BITS
 
 class TileLists(NamedTuple):
     """Pairs of a Gaussian and a tile that it touches. The pairs of a Gaussian have consecutive numbers.
-    B cameras, at most T tiles, N Gaussians, at most P pairs, at most W bands.
+    At most T tiles, N Gaussians, at most P pairs, W workers.
 
-    first: int32 (B, T + 1), where each tile's list begins in ``pair``.
-    pair: int32 (B, P), pair numbers, tile by tile, front to back.
-    owner: int32 (B, P), the Gaussian of each pair.
-    own_first, own_count: int32 (B, N), the first pair of each Gaussian, and how many it has.
-    needed: int64 (B,), pairs in total. Where that is more than P, the Gaussians that no longer fit, in the
+    first: int32 (T + 1,), where each tile's list begins in ``pair``.
+    pair: int32 (P,), pair numbers, tile by tile, front to back.
+    owner: int32 (P,), the Gaussian of each pair.
+    own_first, own_count: int32 (N,), the first pair of each Gaussian, and how many it has.
+    needed: int64 (1,), pairs in total. Where that is more than P, the Gaussians that no longer fit, in the
         order of their numbers, are left out with all their pairs.
-    longest: int64 (B, W), length of the longest tile list in each band.
-    keys, order: uint32 and int32 (workers, 2, N + 1); begins: int32 (workers, N); binned: int32
-        (workers, 2, P): scratch of each worker, kept because allocating it costs more than using it.
+    longest: int64 (W,), length of the longest tile list in each band.
+    keys, order: uint32 and int32 (W, 2, N + 1); begins: int32 (W, N); binned: int32 (W, 2, P): scratch of each
+        worker, kept because allocating it costs more than using it.
     """
 
     first: NDArray[np.int32]
@@ -68,9 +68,9 @@ def _sort(keys, order, n):
 
 
 @device_function
-def _tile_bits(tiles, b, i):
+def _tile_bits(tiles, i):
     """The two TILE_BITS columns of a Gaussian as one 64-bit number."""
-    low, high = np.uint64(np.uint32(tiles[b, i, TILE_BITS])), np.uint64(np.uint32(tiles[b, i, TILE_BITS + 1]))
+    low, high = np.uint64(np.uint32(tiles[i, TILE_BITS])), np.uint64(np.uint32(tiles[i, TILE_BITS + 1]))
     return low | (high << np.uint64(32))
 
 
@@ -89,38 +89,30 @@ def _count_tiles(bits, n):
 
 
 @kernel
-def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
-    """Fill ``lists``. A task is a band: some of a camera's rows of tiles. Each band visits all Gaussians, so
+def bin_tiles(counter, worker, columns, rows, count, tiles, lists):
+    """Fill ``lists``. A task is a band, one for each worker: some rows of tiles. Each band visits all Gaussians, so
     that it knows where its lists begin, and sorts those that touch its tiles. The lists do not depend on the
     number of bands.
 
-    columns, rows: int64 (B,), tiles across and down.
-    bands: number of bands of each camera.
+    columns, rows: tiles across and down.
     count: number of Gaussians.
-    tiles: int32 (B, N, FOOTPRINT), see ``project``.
+    tiles: int32 (N, FOOTPRINT), see ``project``.
     lists: ``TileLists``, written.
     """
+    bands, room = lists.longest.size, lists.pair.size
+    first, pair, owner, own_first, own_count = lists.first, lists.pair, lists.owner, lists.own_first, lists.own_count
+    keys, order, begins, binned = lists.keys[worker], lists.order[worker], lists.begins[worker], lists.binned[worker]
     while True:
-        task = draw(counter, worker, columns.size * bands)
-        b, band = task // bands, task % bands
-        if b >= columns.size:
+        band = draw(counter, worker, bands)
+        if band >= bands:
             return
-        across, down = columns[b], rows[b]
-        top, bottom = down * band // bands, down * (band + 1) // bands
-        first, pair, owner = lists.first[b], lists.pair[b], lists.owner[b]
-        own_first, own_count, room = lists.own_first[b], lists.own_count[b], lists.pair.shape[1]
-        keys, order, begins, binned = (
-            lists.keys[worker],
-            lists.order[worker],
-            lists.begins[worker],
-            lists.binned[worker],
-        )
+        top, bottom = rows * band // bands, rows * (band + 1) // bands
         # Every band computes where each Gaussian's pairs begin; each band stores a share of the Gaussians.
         low, high = count * band // bands, count * (band + 1) // bands
         n = made = needed = above = mine = 0
         for i in range(count):
-            x0, x1, y0, y1 = tiles[b, i, 0], tiles[b, i, 1], tiles[b, i, 2], tiles[b, i, 3]
-            bits, width, size = _tile_bits(tiles, b, i), x1 - x0, (x1 - x0) * (y1 - y0)
+            x0, x1, y0, y1 = tiles[i, 0], tiles[i, 1], tiles[i, 2], tiles[i, 3]
+            bits, width, size = _tile_bits(tiles, i), x1 - x0, (x1 - x0) * (y1 - y0)
             begin, end = min(max(y0, top), y1), min(max(y0, bottom), y1)
             before = _count_tiles(bits, (begin - y0) * width)
             here = _count_tiles(bits, (end - y0) * width) - before
@@ -135,7 +127,7 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
             above += before
             mine += here
             # Written unconditionally: a branch here would be mispredicted too often.
-            keys[0, n], order[0, n] = tiles[b, i, DEPTH_KEY], i
+            keys[0, n], order[0, n] = tiles[i, DEPTH_KEY], i
             n += np.int64(here > 0)
         _sort(keys, order, n)
         end = begins[high] if high < count else made
@@ -146,17 +138,17 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
                 p += 4
             for q in range(p, begins[i] + pairs):
                 owner[q] = i
-        t0, own_tiles = top * across, (bottom - top) * across
+        t0, own_tiles = top * columns, (bottom - top) * columns
         cursor = np.zeros(own_tiles + 1, np.int64)
         made = 0
         for k in range(n):
             i = order[0, k]
-            x0, x1, y0, y1 = tiles[b, i, 0], tiles[b, i, 1], tiles[b, i, 2], tiles[b, i, 3]
-            bits, width, size = _tile_bits(tiles, b, i), x1 - x0, (x1 - x0) * (y1 - y0)
+            x0, x1, y0, y1 = tiles[i, 0], tiles[i, 1], tiles[i, 2], tiles[i, 3]
+            bits, width, size = _tile_bits(tiles, i), x1 - x0, (x1 - x0) * (y1 - y0)
             begin, end, p = min(max(y0, top), y1), min(max(y0, bottom), y1), np.int64(begins[i])
             skipped = (begin - y0) * width
             p += _count_tiles(bits, skipped)
-            corner, over = begin * across + x0 - t0, across - width
+            corner, over = begin * columns + x0 - t0, columns - width
             if size <= 64:
                 left = _low_bits(bits, (end - y0) * width)
                 left = (left >> np.uint64(skipped)) if skipped < 64 else np.uint64(0)
@@ -179,13 +171,12 @@ def bin_tiles(counter, worker, columns, rows, bands, count, tiles, lists):
                         p += 1
         longest = 0
         if band == 0:
-            first[0] = lists.longest[b, bands:] = 0
-            lists.needed[b] = needed
+            first[0], lists.needed[0] = 0, needed
         for t in range(own_tiles):
             longest = max(longest, cursor[t + 1])
             cursor[t + 1] += cursor[t]
             first[t0 + t + 1] = above + cursor[t + 1]
-        lists.longest[b, band] = longest
+        lists.longest[band] = longest
         for k in range(mine):
             t = binned[1, k]
             pair[above + cursor[t]] = binned[0, k]

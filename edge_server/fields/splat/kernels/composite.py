@@ -54,15 +54,15 @@ _LAST, _SLACK = np.float32(TILE - 1), np.float32(1e-3)  # pixels
 
 
 @device_function
-def bin_strips(lists, b, begin, end, projected, y0, strip_pairs, count):
-    """Split a tile's list lists.pair[b, begin:end] into one list a strip, front to back. y0: the tile's
+def bin_strips(lists, begin, end, projected, y0, strip_pairs, count):
+    """Split a tile's list lists.pair[begin:end] into one list a strip, front to back. y0: the tile's
     first row of pixels. strip_pairs: int32 (STRIPS, N) and count: int64 (STRIPS,), both written."""
     n0 = n1 = n2 = n3 = 0
     for j in range(begin, end):
-        p = lists.pair[b, j]
-        i = lists.owner[b, p]
-        middle = projected[b, i, MEAN_Y] - np.float32(y0) - _HALF
-        reach = projected[b, i, HALF_HEIGHT] + _SLACK
+        p = lists.pair[j]
+        i = lists.owner[p]
+        middle = projected[i, MEAN_Y] - np.float32(y0) - _HALF
+        reach = projected[i, HALF_HEIGHT] + _SLACK
         # Clamped to rows 0..7: the list has only Gaussians that reach the tile.
         top = np.int64(min(max(np.ceil(middle - reach), _F0), _LAST)) >> 1
         bottom = np.int64(min(max(middle + reach, _F0), _LAST)) >> 1

@@ -129,14 +129,14 @@ def clamp_gaussians(params):
 
 
 @device_function
-def _gather_gradients(base, here, touched, params, moments, rule, s, g):
+def _gather_gradients(base, here, params, moments, rule, s, g):
     """Write a block's gradients (NaN: leave the parameter as it is), rates and second bias corrections to the
     thirds of ``g``, a Gaussian's parameters side by side. Returns how many gradients are not finite."""
     width = params.shape[1]
     third, lost = BLOCK * width, 0
     for j in range(here):
         i, at = base + j, j * width
-        if not touched[j]:
+        if s[SEEN + j] == _F0:
             for k in range(width):
                 g[at + k] = _NAN
             continue
@@ -176,21 +176,20 @@ def _adam(first, size, params, moments, rule, g):
 
 
 @kernel
-def adam_step(counter, worker, cams, gaussians, count, projected, lists, pair_sums, moments, rule, dropped, rigid):
+def adam_step(counter, worker, camera, gaussians, count, projected, lists, pair_sums, moments, rule, dropped, rigid):
     """An Adam step of all Gaussians that have pairs; the others and their moments stay as they are. Tasks
     are blocks of Gaussians.
 
-    cams: float32 (B, CAMERA), the cameras of this step.
+    camera: float32 (1, CAMERA), the camera of this step.
     projected, lists, pair_sums: see ``project``, ``TileLists``, ``composite_backward``.
     moments: ``OptimizerState``, updated. rule: ``AdamParameters``.
     dropped: int64 (blocks,), written: gradients that were not finite.
     rigid: float64 (blocks, 6), 0 at first; sums over blocks are the force and torque on all Gaussians as one rigid
-        body, about the only camera's center (``add_force``, ``add_torque``). (0, 6): not asked for.
+        body, about the camera's center (``add_force``, ``add_torque``). (0, 6): not asked for.
     """
-    params, own_first, own_count = gaussians.params, lists.own_first, lists.own_count
+    params = gaussians.params
     width = params.shape[1]
-    s, ids, touched = block_scratch(width), np.empty(BLOCK, np.int64), np.empty(BLOCK, np.bool_)
-    g = np.empty(3 * width * BLOCK, np.float32)
+    s, g = block_scratch(width), np.empty(3 * width * BLOCK, np.float32)
     blocks = (count + BLOCK - 1) // BLOCK
     while True:
         block = draw(counter, worker, blocks)
@@ -198,31 +197,27 @@ def adam_step(counter, worker, cams, gaussians, count, projected, lists, pair_su
             return
         base = block * BLOCK
         here = min(BLOCK, count - base)
+        dropped[block] = 0
+        if gather_sums(base, here, projected, lists, pair_sums, s) == 0:
+            continue
+        load_block(gaussians, base, here, s)
+        cam = load_camera(camera, 0)
+        project_backward(cam, s)
+        if rigid.shape[0] > 0:
+            add_torque(cam, s, here, rigid[block, 3:])
+        harmonics_backward(cam, gaussians, base, here, s)
+        if rigid.shape[0] > 0:
+            add_force(s, here, rigid[block])
         for j in range(here):
-            ids[j], touched[j] = base + j, False
-        load_block(gaussians, ids, here, s)
-        for b in range(cams.shape[0]):
-            if gather_sums(b, ids, here, projected, own_first, own_count, pair_sums, s) == 0:
+            i, slope = base + j, s[SLOPE + j]
+            if s[SEEN + j] == _F0:
                 continue
-            cam = load_camera(cams, b)
-            project_backward(cam, s)
-            if rigid.shape[0] > 0:
-                add_torque(cam, s, here, rigid[block, 3:])
-            harmonics_backward(cam, gaussians, ids, here, s)
-            if rigid.shape[0] > 0:
-                add_force(s, here, rigid[block])
-            for j in range(here):
-                i, slope = base + j, s[SLOPE + j]
-                if s[SEEN + j] == _F0:
-                    continue
-                touched[j] = True
-                if is_finite(slope) and slope > _F0:
-                    moments.slope[i] += slope * cam[SIZE]
-                    moments.looks[i] += _F1
-                moments.reach[i] = max(moments.reach[i], projected[b, i, RADIUS] / cam[SIZE])
-        lost = _gather_gradients(base, here, touched, params, moments, rule, s, g)
+            if is_finite(slope) and slope > _F0:
+                moments.slope[i] += slope * cam[SIZE]
+                moments.looks[i] += _F1
+            moments.reach[i] = max(moments.reach[i], projected[i, RADIUS] / cam[SIZE])
+        dropped[block] = _gather_gradients(base, here, params, moments, rule, s, g)
         _adam(base * width, here * width, params, moments, rule, g)
         for j in range(here):
-            if touched[j]:
+            if s[SEEN + j] > _F0:
                 clamp_gaussian(params, base + j)
-        dropped[block] = lost

@@ -115,9 +115,8 @@ def rotate_to_world(cam, j0, j1, j2):
 
 @device_function
 def _load_block(gaussians, base, count, s):
-    """Load what is the same for all cameras of Gaussians base, ..., base + count - 1 into the rows of ``s``:
-    position, axes of the ellipsoid times their lengths, opacity, and the Gaussian's extent in
-    standard deviations squared (0: invisible)."""
+    """Load Gaussians base, ..., base + count - 1 into the rows of ``s``: position, axes of the ellipsoid times their
+    lengths, opacity, and the Gaussian's extent in standard deviations squared (0: invisible)."""
     params = gaussians.params
     for j in range(count):
         i = base + j
@@ -248,28 +247,25 @@ def _write_projected(cam, gaussians, i, s, j, row, edges):
 
 
 @kernel
-def project(counter, worker, cams, gaussians, count, projected, tiles):
-    """Project all Gaussians into all cameras. Tasks are blocks of Gaussians, each for all cameras: what does
-    not depend on the camera is computed once.
+def project(counter, worker, camera, gaussians, count, projected, tiles):
+    """Project all Gaussians into a camera. Tasks are blocks of Gaussians.
 
-    cams: float32 (B, CAMERA).
+    camera: float32 (1, CAMERA).
     gaussians: ``Gaussians``, of which the first ``count`` are projected.
-    projected: float32 (B, >= count, PROJECTED), written where a Gaussian is in the image.
-    tiles: int32 (B, >= count, FOOTPRINT), written.
+    projected: float32 (>= count, PROJECTED), written where a Gaussian is in the image.
+    tiles: int32 (>= count, FOOTPRINT), written.
     """
-    s = np.zeros(_ROWS * BLOCK, np.float32)
+    cam, s = load_camera(camera, 0), np.zeros(_ROWS * BLOCK, np.float32)
     while True:
         base = draw(counter, worker, (count + BLOCK - 1) // BLOCK) * BLOCK
         if base >= count:
             return
         here = min(BLOCK, count - base)
         _load_block(gaussians, base, here, s)
-        for b in range(cams.shape[0]):
-            cam = load_camera(cams, b)
-            _project_block(cam, s)
-            for j in range(here):
-                i = base + j
-                edges = tiles[b, i]
-                edges[0] = edges[1] = edges[2] = edges[3] = 0
-                if s[_LEFT + j] <= s[_RIGHT + j]:
-                    _write_projected(cam, gaussians, i, s, j, projected[b, i], edges)
+        _project_block(cam, s)
+        for j in range(here):
+            i = base + j
+            edges = tiles[i]
+            edges[0] = edges[1] = edges[2] = edges[3] = 0
+            if s[_LEFT + j] <= s[_RIGHT + j]:
+                _write_projected(cam, gaussians, i, s, j, projected[i], edges)

@@ -29,9 +29,9 @@ from edge_server.fields.splat.kernels.project import (
 )
 from edge_server.fields.splat.splat_constants import LOG_SCALE_HIGH, LOG_SCALE_LOW, RAW_OPACITY_LIMIT
 
-# Rows of BLOCK numbers: position, raw scale, quaternion, raw opacity; then for one camera: opacity,
-# conic, sums over pairs, whether there are any pairs, and the length of the gradient by the projected mean;
-# from GRADIENT on, a row for each parameter's gradient.
+# Rows of BLOCK numbers: position, raw scale, quaternion, raw opacity; then as projected: opacity, conic, sums over
+# pairs, whether there are any pairs, and the length of the gradient by the projected mean; from GRADIENT on, a row for
+# each parameter's gradient.
 _X, _S, _Q, _RAW, _ALPHA, _QA, _QB, _QC, SUM = (n * BLOCK for n in (0, 3, 6, 10, 11, 12, 13, 14, 15))
 SEEN, SLOPE, GRADIENT = (n * BLOCK for n in (24, 25, 26))
 _ROWS = 26
@@ -46,11 +46,11 @@ def block_scratch(width):
 
 
 @device_function
-def load_block(gaussians, ids, count, s):
-    """Load Gaussians ids[:count] into the rows of ``s`` and set their gradients to 0."""
+def load_block(gaussians, base, count, s):
+    """Load Gaussians base, ..., base + count - 1 into the rows of ``s`` and set their gradients to 0."""
     params = gaussians.params
     for j in range(count):
-        i = ids[j]
+        i = base + j
         for k in range(3):
             s[_X + k * BLOCK + j] = params[i, k]
             s[_S + k * BLOCK + j] = params[i, SCALE + k]
@@ -62,21 +62,20 @@ def load_block(gaussians, ids, count, s):
 
 
 @device_function
-def gather_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
-    """Add up the sums of each Gaussian's pairs in camera slot b, in a fixed order. Returns how many Gaussians
-    of the block have pairs there."""
+def gather_sums(base, count, projected, lists, pair_sums, s):
+    """Add up the sums of each Gaussian's pairs, in a fixed order. Returns how many Gaussians of the block have some."""
     seen = 0
     for j in range(count):
-        i = ids[j]
-        first, pairs = np.int64(own_first[b, i]), np.int64(own_count[b, i])
+        i = base + j
+        first, pairs = np.int64(lists.own_first[i]), np.int64(lists.own_count[i])
         s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = _F0
         for p in range(first, first + pairs):
-            row = pair_sums[b, p]
+            row = pair_sums[p]
             s0, s1, s2, s3, s4 = s0 + row[0], s1 + row[1], s2 + row[2], s3 + row[3], s4 + row[4]
             s5, s6, s7, s8 = s5 + row[5], s6 + row[6], s7 + row[7], s8 + row[8]
         for k, value in enumerate((s0, s1, s2, s3, s4, s5, s6, s7, s8)):
             s[SUM + k * BLOCK + j] = value
-        row = projected[b, i]
+        row = projected[i]
         s[_ALPHA + j] = row[ALPHA]
         s[_QA + j], s[_QB + j], s[_QC + j] = row[CONIC_A], row[CONIC_B], row[CONIC_C]
         s[SEEN + j] = _F1 if pairs > 0 else _F0
@@ -88,7 +87,7 @@ def gather_sums(b, ids, count, projected, own_first, own_count, pair_sums, s):
 
 @device_function
 def project_backward(cam, s):
-    """Add one camera's gradients to the rows from GRADIENT on. cam: see ``load_camera``.
+    """Add the gradients to the rows from GRADIENT on. cam: see ``load_camera``.
 
     The sums over the pixels that a Gaussian covers are: h = d loss / d power, h dx, h dy, h dx^2, h dx dy,
     h dy^2, with (dx, dy) from the mean to the pixel, and d loss / d color. Row SLOPE gets the length of the
@@ -189,7 +188,7 @@ def project_backward(cam, s):
 
 
 @device_function
-def harmonics_backward(cam, gaussians, ids, count, s):
+def harmonics_backward(cam, gaussians, base, count, s):
     """Add the gradient by way of the view-dependent color, which ``project_backward`` leaves out."""
     params = gaussians.params
     if gaussians.sh_degree == 0:
@@ -197,7 +196,7 @@ def harmonics_backward(cam, gaussians, ids, count, s):
     for j in range(count):
         if s[SEEN + j] == _F0:
             continue
-        i, at = ids[j], GRADIENT + j
+        i, at = base + j, GRADIENT + j
         nx, ny, nz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (params[i, 2] - cam[ORIGIN + 2])
         length = _F1 / max(np.sqrt(nx * nx + ny * ny + nz * nz), np.float32(1e-9))
         nx, ny, nz = nx * length, ny * length, nz * length

@@ -32,8 +32,8 @@ from edge_server.fields.splat.kernels.project import TILE
 _T, _R, _G, _B, _Z = (n * PIXELS for n in range(5))
 _ER, _BEHIND = 5 * PIXELS, 8 * PIXELS
 ROWS = 9
-EXPOSURE = 7  # columns of ``Targets.exposure``
-# Columns of a tile's losses: the loss, whether it was not finite, and, where exposures are asked for, for each
+EXPOSURE = 7  # numbers of ``Target.exposure``
+# Columns of a tile's losses: the loss, whether it was not finite, and, where an exposure is given, for each
 # channel the sums over pixels of their weights w, and of w r, w r r, w t and w r t: r is what is rendered, t the
 # image at the field's exposure.
 LOSSES, MOMENTS = 2, 5
@@ -43,26 +43,23 @@ _BYTE = np.float32(1.0 / 255.0)
 _C1, _C2 = np.float32(0.01**2), np.float32(0.03**2)  # of SSIM (Wang et al. 2004), for colors in [0, 1]
 
 
-class Targets(NamedTuple):
-    """The images that training compares with, the pixels of one after those of the other.
+class Target(NamedTuple):
+    """The image that a step compares with.
 
-    first: int64 (V + 1,), where each image begins. size: int64 (V, 2), width and height.
-    pixels: uint8 (P, 3 or 4).
-    weight: float32 (P,), how much each pixel counts; (0,) where all count in full.
-    behind: float32 (P, 3), steps of 255, what is behind the Gaussians in each pixel; (0, 3): ``background``.
+    image: uint8 (H, W, 3 or 4).
+    weight: float32 (H, W), how much each pixel counts; (0, 0) where all count in full.
     background: float32 (3,), in [0, 1].
-    exposure: float32 (V, EXPOSURE), for each image the three gains and the three biases by which a rendering becomes
-        the image, and a factor on its loss; (0, EXPOSURE): images are as rendered.
+    behind: float32 (H, W, 3), steps of 255, what is behind the Gaussians in each pixel; (0, 0, 3): ``background``.
+    exposure: float32 (EXPOSURE,), the three gains and the three biases by which a rendering becomes the image, and a
+        factor on its loss; (0,): it is as rendered.
     dissimilarity: weight in the loss of (1 - SSIM) / 2, of each channel of a tile and times its pixels. 0: none.
     """
 
-    first: NDArray[np.int64]
-    size: NDArray[np.int64]
-    pixels: NDArray[np.uint8]
+    image: NDArray[np.uint8]
     weight: NDArray[np.float32]
-    behind: NDArray[np.float32]
     background: NDArray[np.float32]
-    exposure: NDArray[np.float32] = np.zeros((0, EXPOSURE), np.float32)
+    behind: NDArray[np.float32] = np.zeros((0, 0, 3), np.float32)
+    exposure: NDArray[np.float32] = np.zeros(0, np.float32)
     dissimilarity: np.float32 = np.float32(0.0)
 
 
@@ -70,7 +67,7 @@ class Raster(NamedTuple):
     """The Gaussians that a camera sees, and the memory in which W workers rasterize them.
 
     columns, rows: tiles across and down.
-    projected: float32 (B, N, PROJECTED), see ``project``. lists: by tile. The camera is slot 0 of both.
+    projected: float32 (N, PROJECTED), see ``project``. lists: by tile.
     memory: float32 (W, ROWS * PIXELS), a tile. saved: float32 (W, longest * STRIPS * SAVED), what compositing saves;
         (W, SAVED) where nothing is differentiated.
     """
@@ -95,9 +92,8 @@ def clear_tile(s):
 def strip_scratch(lists):
     """Arrays for ``bin_strips`` that fit the longest tile list: strip_pairs and count."""
     longest = np.int64(1)
-    for b in range(lists.longest.shape[0]):
-        for r in range(lists.longest.shape[1]):
-            longest = max(longest, lists.longest[b, r])
+    for band in range(lists.longest.size):
+        longest = max(longest, lists.longest[band])
     return np.empty((STRIPS, longest), np.int32), np.empty(STRIPS, np.int64)
 
 
@@ -106,9 +102,9 @@ def begin_tile(raster, t, s, strip_pairs, count):
     """Reset the tile memory ``s`` and list the Gaussians of each strip of tile t. Returns the tile's first pixel, x and
     y, and where its list begins and ends."""
     x0, y0 = TILE * (t % raster.columns), TILE * (t // raster.columns)
-    begin, end = np.int64(raster.lists.first[0, t]), np.int64(raster.lists.first[0, t + 1])
+    begin, end = np.int64(raster.lists.first[t]), np.int64(raster.lists.first[t + 1])
     clear_tile(s)
-    bin_strips(raster.lists, 0, begin, end, raster.projected, y0, strip_pairs, count)
+    bin_strips(raster.lists, begin, end, raster.projected, y0, strip_pairs, count)
     return x0, y0, begin, end
 
 
@@ -120,8 +116,8 @@ def composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, step, c
         composited[n] = composite(
             strip_pairs[n],
             count[n],
-            raster.lists.owner[0],
-            raster.projected[0],
+            raster.lists.owner,
+            raster.projected,
             np.float32(x0),
             np.float32(y0 + 2 * n),
             s,
@@ -134,81 +130,79 @@ def composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, step, c
 @device_function
 def _composite_strips_backward(raster, begin, end, strip_pairs, composited, x0, y0, s, store, size, sums):
     """``composite_backward`` all strips of a tile, whose list goes from ``begin`` to ``end``: writes the rows of its
-    pairs in ``sums``, float32 (B, P, SUMS). s: the tile's memory, from ER on the slopes."""
+    pairs in ``sums``, float32 (P, SUMS). s: the tile's memory, from ER on the slopes."""
     for j in range(begin, end):
-        rest = sums[0, raster.lists.pair[0, j]]
+        rest = sums[raster.lists.pair[j]]
         for k in range(SUMS):
             rest[k] = _F0
     for n in range(STRIPS):
         composite_backward(
             strip_pairs[n],
             composited[n],
-            raster.lists.owner[0],
-            raster.projected[0],
+            raster.lists.owner,
+            raster.projected,
             np.float32(x0),
             np.float32(y0 + 2 * n),
             s,
             _ER + n * STRIP,
             store[n * size : (n + 1) * size],
-            sums[0],
+            sums,
         )
 
 
 @device_function
-def _load_tile(targets, view, x0, y0, target, behind, share):
-    """Fill target and behind, (3, PIXELS), and share (PIXELS,), the pixels' weights, 0 outside the image. Returns
+def _load_tile(target, x0, y0, color, behind, share):
+    """Fill color and behind, (3, PIXELS), and share (PIXELS,), the pixels' weights, 0 outside the image. Returns
     whether any pixel counts."""
-    width, height, first = targets.size[view, 0], targets.size[view, 1], targets.first[view]
-    own, weighed = targets.behind.shape[0] > 0, targets.weight.size > 0
-    transparent, some = targets.pixels.shape[1] == 4, False
+    height, width, channels = target.image.shape
+    own, weighed = target.behind.shape[0] > 0, target.weight.size > 0
+    transparent, some = channels == 4, False
     for c in range(3):
         for k in range(PIXELS):
-            behind[c, k] = targets.background[c]
+            behind[c, k] = target.background[c]
     for k in range(PIXELS):
         x, y = x0 + k % TILE, y0 + k // TILE
         share[k] = _F0
         if x < width and y < height:
-            pixel = first + y * width + x
-            share[k] = targets.weight[pixel] if weighed else _F1
-            opaque = np.float32(targets.pixels[pixel, 3]) * _BYTE if transparent else _F1
+            share[k] = target.weight[y, x] if weighed else _F1
+            opaque = np.float32(target.image[y, x, 3]) * _BYTE if transparent else _F1
             for c in range(3):
                 if own:
-                    behind[c, k] = targets.behind[pixel, c] * _BYTE
-                color = np.float32(targets.pixels[pixel, c]) * _BYTE
-                target[c, k] = color * opaque + behind[c, k] * (_F1 - opaque)
+                    behind[c, k] = target.behind[y, x, c] * _BYTE
+                color[c, k] = np.float32(target.image[y, x, c]) * _BYTE * opaque + behind[c, k] * (_F1 - opaque)
         else:
-            target[0, k] = target[1, k] = target[2, k] = _F0
+            color[0, k] = color[1, k] = color[2, k] = _F0
         some |= share[k] > _F0
     return some
 
 
 @device_function
-def _undo_exposure(exposure, target, share):
-    """Change target (3, PIXELS) to the field's exposure, and weigh its pixels, share (PIXELS,), by what an error there
-    means in the image. exposure: a row of ``Targets.exposure``."""
+def _undo_exposure(exposure, color, share):
+    """Change color (3, PIXELS) to the field's exposure, and weigh its pixels, share (PIXELS,), by what an error there
+    means in the image. exposure: see ``Target``."""
     for c in range(3):
         inverse, bias = _F1 / exposure[c], exposure[3 + c]
         for k in range(PIXELS):
-            target[c, k] = (target[c, k] - bias) * inverse
+            color[c, k] = (color[c, k] - bias) * inverse
     for k in range(PIXELS):
         share[k] *= exposure[6]
 
 
 @device_function
-def _add_moments(s, behind, target, share, losses):
+def _add_moments(s, behind, color, share, losses):
     """Write the columns of ``losses`` from LOSSES on. s: the tile's memory."""
     for c in range(3):
         w = wr = wrr = wt = wrt = _F0
         for k in range(PIXELS):
             r = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k]
-            t, share_r = target[c, k], share[k] * r
+            t, share_r = color[c, k], share[k] * r
             w, wr, wrr, wt, wrt = w + share[k], wr + share_r, wrr + share_r * r, wt + share[k] * t, wrt + share_r * t
         for n, total in enumerate((w, wr, wrr, wt, wrt)):
             losses[LOSSES + c * MOMENTS + n] = total
 
 
 @device_function
-def _add_dissimilarity(s, behind, target, share, weight):
+def _add_dissimilarity(s, behind, color, share, weight):
     """Add the gradient of ``weight`` (1 - SSIM) / 2, times the tile's pixels, to the rows from ER on, and what the
     background has of it. A tile is the window of SSIM (Wang et al. 2004); windows do not overlap."""
     w = _F0
@@ -218,7 +212,7 @@ def _add_dissimilarity(s, behind, target, share, weight):
     for c in range(3):
         mr = mt = rr = tt = rt = _F0
         for k in range(PIXELS):
-            r, t = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k], target[c, k]
+            r, t = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k], color[c, k]
             mr, mt = mr + share[k] * r, mt + share[k] * t
             rr, tt, rt = rr + share[k] * r * r, tt + share[k] * t * t, rt + share[k] * r * t
         mr, mt = mr * over, mt * over
@@ -230,38 +224,38 @@ def _add_dissimilarity(s, behind, target, share, weight):
         by_t, by_r = half * alike * _F2 / spreads, -half * alike * _F2 * together / spreads
         for k in range(PIXELS):
             r = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k]
-            slope = share[k] * (by_mean + by_t * (target[c, k] - mt) + by_r * (r - mr))
+            slope = share[k] * (by_mean + by_t * (color[c, k] - mt) + by_r * (r - mr))
             s[_ER + c * PIXELS + k] += slope
             s[_BEHIND + k] += s[_T + k] * behind[c, k] * slope
 
 
 @kernel
-def train_tiles(counter, worker, raster, targets, view, sums, losses):
-    """Render the raster, compare it with image ``view`` of the targets, and backpropagate to the pairs. Tasks are
-    tiles. The loss is the squared color error times the pixel's weight, summed over pixels, and what
-    ``Targets.dissimilarity`` adds (its gradient only).
+def train_tiles(counter, worker, raster, target, sums, losses):
+    """Render the raster, compare it with ``target``, and backpropagate to the pairs. Tasks are tiles. The loss is the
+    squared color error times the pixel's weight, summed over pixels, and what ``Target.dissimilarity`` adds (its
+    gradient only).
 
-    sums: float32 (B, P, SUMS), written for the pairs of slot 0.
+    sums: float32 (P, SUMS), written.
     losses: float64 (tiles, LOSSES), written: the loss, and 1 if the tile is left out as not finite. With
         3 MOMENTS more columns: see there.
     """
     lists, tiles = raster.lists, raster.columns * raster.rows
     s, store, share = raster.memory[worker], raster.saved[worker], np.empty(PIXELS, np.float32)
-    target, behind = np.empty((3, PIXELS), np.float32), np.empty((3, PIXELS), np.float32)
+    color, behind = np.empty((3, PIXELS), np.float32), np.empty((3, PIXELS), np.float32)
     (strip_pairs, count), composited = strip_scratch(lists), np.empty(STRIPS, np.int64)
     while True:
         t = draw(counter, worker, tiles)
         if t >= tiles:
             return
         # Nothing to learn, and most tiles are such.
-        if (lists.first[0, t] == lists.first[0, t + 1]) & (targets.behind.shape[0] > 0):
+        if (lists.first[t] == lists.first[t + 1]) & (target.behind.shape[0] > 0):
             losses[t, 0] = losses[t, 1] = 0.0
             continue
         x0, y0, begin, end = begin_tile(raster, t, s, strip_pairs, count)
-        if not _load_tile(targets, view, x0, y0, target, behind, share):
+        if not _load_tile(target, x0, y0, color, behind, share):
             count[0] = count[1] = count[2] = count[3] = 0
-        if targets.exposure.shape[0] > 0:
-            _undo_exposure(targets.exposure[view], target, share)
+        if target.exposure.size > 0:
+            _undo_exposure(target.exposure, color, share)
         size = (end - begin) * SAVED
         composite_strips(raster, strip_pairs, count, x0, y0, s, store, size, SAVED, composited)
         square = _F0
@@ -269,15 +263,15 @@ def train_tiles(counter, worker, raster, targets, view, sums, losses):
             s[_BEHIND + k] = _F0
         for c in range(3):
             for k in range(PIXELS):
-                e = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k] - target[c, k]
+                e = s[_R + c * PIXELS + k] + s[_T + k] * behind[c, k] - color[c, k]
                 slope = _F2 * (share[k] * e)
                 square += share[k] * (e * e)
                 s[_ER + c * PIXELS + k] = slope
                 s[_BEHIND + k] += s[_T + k] * behind[c, k] * slope
-        if targets.dissimilarity > _F0:
-            _add_dissimilarity(s, behind, target, share, targets.dissimilarity)
+        if target.dissimilarity > _F0:
+            _add_dissimilarity(s, behind, color, share, target.dissimilarity)
         if losses.shape[1] > LOSSES:
-            _add_moments(s, behind, target, share, losses[t])
+            _add_moments(s, behind, color, share, losses[t])
         finite = is_finite(square)
         losses[t, 0], losses[t, 1] = square if finite else 0.0, 0.0 if finite else 1.0
         if not finite:

@@ -17,7 +17,7 @@ from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune, opacity
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
 from edge_server.fields.splat.kernels.project import Gaussians
-from edge_server.fields.splat.kernels.rasterize import Targets
+from edge_server.fields.splat.kernels.rasterize import Target
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.align import align_view
 from edge_server.fields.splat.layers.motion import Motion, ViewRow
@@ -103,7 +103,7 @@ class MovingSet:
         self.raster.project_and_bin(camera.row, gaussians, differentiate=False)
         m, v, shown, opacity = align_view(
             self.raster,
-            camera.row[0],
+            camera.row,
             gaussians.params[:, :3],
             observation.view.image,
             camera.plate.picture,
@@ -140,7 +140,7 @@ class MovingSet:
         gaussians = self.gaussians(observation.instant_s)
         before = gaussians.params[:, :3].copy()
         raster.project_and_bin(camera.row, gaussians)
-        raster.train(_over_plate(observation, camera), 0)
+        raster.train(_over_plate(observation, camera))
         raster.step(camera.row, gaussians, cloud.optimizer_state(), parameters)
         rest = cloud.params[:, :3] + (gaussians.params[:, :3] - before)
         cloud.params[:] = gaussians.params
@@ -310,17 +310,9 @@ class MovingSet:
         return np.random.default_rng(np.random.SeedSequence([self.seed, self._draws, purpose, 6]))
 
 
-def _over_plate(observation: Observation, camera: FixedCamera) -> Targets:
+def _over_plate(observation: Observation, camera: FixedCamera) -> Target:
     """A frame as what to learn, over the camera's plate, so that errors of the still field do not reach the moving
     set."""
-    image, weight = observation.view.image, observation.weight
-    assert weight is not None
-    height, width = weight.shape
-    return Targets(
-        np.array([0, height * width]),
-        np.array([[width, height]]),
-        image.reshape(-1, 3),
-        weight.reshape(-1),
-        camera.plate.picture.reshape(-1, 3),
-        np.zeros(3, np.float32),
-    )
+    assert observation.weight is not None
+    image = np.ascontiguousarray(observation.view.image)
+    return Target(image, observation.weight, np.zeros(3, np.float32), camera.plate.picture)

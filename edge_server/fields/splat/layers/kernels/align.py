@@ -58,8 +58,8 @@ def align_view(
     """Normal matrix (3K, 3K) and right side (3K,) of one view, see ``motion.ViewRow``; what is shown, float32
     (H, W, 3), and the Gaussians' opacity, float32 (H, W). Tiles of weight 0 show the plate alone.
 
-    raster: ``RasterBuffers`` whose last ``project_and_bin`` had this camera first.
-    camera: float32 (CAMERA,), its row.
+    raster: ``RasterBuffers`` whose last ``project_and_bin`` had this camera.
+    camera: float32 (1, CAMERA), its row.
     places: float32 (N, 3), of the projected Gaussians, scene units.
     image: uint8 (H, W, 3). plate: float32 (H, W, 3), of 255. weight: float32 (H, W), at least 0.
     anchor, share: int64 and float32 (N, 3), see ``Motion.attach``. anchors: K, how many there are.
@@ -67,19 +67,7 @@ def align_view(
     matrix, vector = np.empty((3 * anchors, 3 * anchors)), np.empty(3 * anchors)
     shown, opacity = np.empty(image.shape, np.float32), np.empty(image.shape[:2], np.float32)
     raster.pool.run(
-        add_view,
-        image,
-        plate,
-        weight,
-        raster.first,
-        camera[None],
-        places,
-        anchor,
-        share,
-        matrix,
-        vector,
-        shown,
-        opacity,
+        add_view, image, plate, weight, raster.raster, camera, places, anchor, share, matrix, vector, shown, opacity
     )
     return matrix, vector, shown, opacity
 
@@ -290,7 +278,7 @@ def add_view(
     store = np.empty(STRIPS * size, np.float32)
     for t in range(raster.columns * raster.rows):
         x0, y0 = TILE * (t % raster.columns), TILE * (t // raster.columns)
-        some = lists.first[0, t] < lists.first[0, t + 1]
+        some = lists.first[t] < lists.first[t + 1]
         if not some or not _heaviest(image, plate, weight, x0, y0, behind) > _F0:
             continue
         _, _, begin, end = begin_tile(raster, t, s, strip_pairs, count)
@@ -298,7 +286,7 @@ def add_view(
         _compare(s, image, weight, x0, y0, behind, rest, shown, opacity)
         many = 0
         for j in range(begin, end):
-            i = lists.owner[0, lists.pair[0, j]]
+            i = lists.owner[lists.pair[j]]
             for m in range(ATTACHED):
                 a = anchor[i, m]
                 if mark[a] != t:
@@ -311,8 +299,8 @@ def add_view(
             _spread(
                 strip_pairs[n],
                 composited[n],
-                lists.owner[0],
-                raster.projected[0],
+                lists.owner,
+                raster.projected,
                 np.float32(x0),
                 np.float32(y0 + 2 * n),
                 behind,

@@ -59,7 +59,7 @@ def test_the_normal_matrix_is_that_of_differences_and_a_wrong_pose_comes_back() 
         moved = [[_wall(_moved(now, sign * step)) for sign in (1.0, -1.0)] for step in steps]
         gradient = [(np.square(a - image).sum() - np.square(b - image).sum()) / 2e-4 for a, b in moved]
         errors.append(np.square(_wall(now) - image).mean())
-        assert poses.descend(view, np.array(gradient), found, WALL_M / LENS.fx) == ["a"]
+        poses.descend(view, np.array(gradient), found, WALL_M / LENS.fx)
     assert errors[-1] < 0.01 * errors[0]
 
 
@@ -117,9 +117,9 @@ def test_a_step_moves_the_views_taken_around_it_but_not_those_without_times() ->
         for _ in range(2):
             before = settled.known["v00"].shift_m
             settled.descend(views[0], np.full(6, 5.0), normal, WALL_M / LENS.fx)
-        changed = poses.descend(views[0], np.full(6, 5.0), normal, WALL_M / LENS.fx)
+        poses.descend(views[0], np.full(6, 5.0), normal, WALL_M / LENS.fx)
         sizes = [np.linalg.norm(poses.known[view.camera].shift_m) for view in views]
-        assert len(changed) == np.count_nonzero(sizes) == moved and np.argmax(sizes) == 0
+        assert np.count_nonzero(sizes) == moved and np.argmax(sizes) == 0
         assert not poses.known["elsewhere"].shift_m.any()
         # The second step of a view is a quarter of a full one where those get shorter after a quarter of a step.
         np.testing.assert_allclose(settled.known["v00"].shift_m - before, poses.known["v00"].shift_m / 4.0, atol=1e-12)

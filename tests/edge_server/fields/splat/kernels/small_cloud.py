@@ -1,5 +1,7 @@
 """Random Gaussians in a small box, what cameras see of them, and a step, for the tests of the kernels."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,7 +10,7 @@ from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState
 from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, Gaussians
-from edge_server.fields.splat.kernels.rasterize import Targets
+from edge_server.fields.splat.kernels.rasterize import Target
 
 BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
 BACK = np.array([0.2, 0.5, 0.9], np.float32)
@@ -30,30 +32,30 @@ def as_gaussians(params: np.ndarray) -> Gaussians:
     return Gaussians(params, (params.shape[1] - BASE) // 9)
 
 
-def binned(cams: np.ndarray, params: np.ndarray, differentiate: bool = True, pool: Pool | None = None) -> RasterBuffers:
+def binned(
+    camera: np.ndarray, params: np.ndarray, differentiate: bool = True, pool: Pool | None = None
+) -> RasterBuffers:
     """Buffers after ``project_and_bin``."""
     raster = RasterBuffers(pool or CallerPool())
-    raster.project_and_bin(cams, as_gaussians(params), differentiate)
+    raster.project_and_bin(camera, as_gaussians(params), differentiate)
     return raster
 
 
-def targets_of(image: NDArray[np.uint8], weight: NDArray[np.float32] | None = None, *rest: object) -> Targets:
-    """One image (H, W, C) as target. rest: what is behind it, the background, exposures, share of dissimilarity."""
-    h, w = image.shape[:2]
-    behind, back, *exposed = rest or (np.zeros((0, 3), np.float32), BACK)
-    weights = np.zeros(0, np.float32) if weight is None else weight.reshape(-1)
-    return Targets(np.array([0, h * w]), np.array([[w, h]]), image.reshape(h * w, -1), weights, behind, back, *exposed)
+def target_of(image: NDArray[np.uint8], weight: NDArray[np.float32] | None = None, **rest: Any) -> Target:
+    """rest: what is behind it, exposure, share of dissimilarity."""
+    weight = np.zeros((0, 0), np.float32) if weight is None else weight
+    return Target(np.ascontiguousarray(image), weight, BACK, **rest)
 
 
 def stepped(
-    cams: np.ndarray, params: np.ndarray, targets: Targets, pool: Pool | None = None
+    camera: np.ndarray, params: np.ndarray, target: Target, pool: Pool | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Losses, their gradient by the parameters, and force and torque; the parameters stay."""
-    raster, n = binned(cams, params, pool=pool), len(params)
-    losses, rigid = raster.train(targets, 0), np.full(6, np.nan)
+    raster, n = binned(camera, params, pool=pool), len(params)
+    losses, rigid = raster.train(target), np.full(6, np.nan)
     flat = [np.zeros(n, np.float32) for _ in range(3)]
     moments = OptimizerState(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
     rule = AdamParameters(np.zeros(params.shape[1], np.float32), np.ones((4, 3), np.float32), np.float32(1e-8))
     assert losses[:, 1].sum() == 0
-    assert raster.step(cams, as_gaussians(params.copy()), moments, rule, rigid) == 0
+    assert raster.step(camera, as_gaussians(params.copy()), moments, rule, rigid) == 0
     return losses, 10.0 * moments.m, rigid  # Adam's first moment, after one step from 0

@@ -41,7 +41,7 @@ def _render(params: np.ndarray, cam: np.ndarray) -> list[np.ndarray]:
     raster = binned(cam, params, differentiate=False, pool=Pool(1, 0))
     w, h = LENS.width, LENS.height
     out = [np.full((h, w, 3), 7, np.float32), np.full((h, w), 7, np.float32), np.full((h, w), 7, np.float32)]
-    raster.pool.run(render_tiles, raster.first, BACK, *out)
+    raster.pool.run(render_tiles, raster.raster, BACK, *out)
     return out
 
 
@@ -79,16 +79,16 @@ def test_gradients_equal_the_oracle(lens: Pinhole, sh_degree: int, weighed: bool
     params, cam = random_params(sh_degree=sh_degree, seed=3), _camera(lens)
     image, share = IMAGE[..., : 3 if over_plate else 4], np.ones(IMAGE.shape[:2])
     weight, behind, alpha = (WEIGHT if weighed else None), BACK, _double(IMAGE[..., 3:] / 255.0)
-    targets = small_cloud.targets_of(image, weight)
+    target = small_cloud.target_of(image, weight)
     if weighed:
         share = share * WEIGHT
     if over_plate:
         plate, alpha = RNG.uniform(0, 255, image.shape).astype(np.float32), torch.ones(1)
-        targets, behind = small_cloud.targets_of(image, weight, plate.reshape(-1, 3), BACK), plate / 255.0
+        target, behind = small_cloud.target_of(image, weight, behind=plate), plate / 255.0
         # Tiles without a Gaussian have nothing to learn, and no loss.
         y, x = np.mgrid[0 : lens.height, 0 : lens.width] // TILE
-        share = share * (np.diff(binned(cam, params).lists.first[0]) > 0)[y * -(-lens.width // TILE) + x]
-    losses, gradient, _ = small_cloud.stepped(cam, params, targets)
+        share = share * (np.diff(binned(cam, params).lists.first) > 0)[y * -(-lens.width // TILE) + x]
+    losses, gradient, _ = small_cloud.stepped(cam, params, target)
     theirs = _double(params).requires_grad_(True)
     color = _oracle(theirs, _double(cam[0]), sh_degree, behind)[0]
     error = color - _double(IMAGE[..., :3] / 255.0) * alpha - (1 - alpha) * _double(behind)
@@ -96,7 +96,7 @@ def test_gradients_equal_the_oracle(lens: Pinhole, sh_degree: int, weighed: bool
     loss.backward()
     assert losses[:, 0].sum() == pytest.approx(loss.item(), rel=1e-4)
     _same(gradient, theirs.grad, 3e-3)
-    np.testing.assert_array_equal(small_cloud.stepped(cam, params, targets, Pool(3, 0))[1], gradient)
+    np.testing.assert_array_equal(small_cloud.stepped(cam, params, target, Pool(3, 0))[1], gradient)
 
 
 # --- what hand-held images add: exposures, dissimilarity, and the gradient by the camera's pose -------
@@ -106,9 +106,9 @@ def _step(
     params: np.ndarray, exposed: bool = True, share: float = 0.0, pool: Pool | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Losses, the gradient by the parameters, and force and torque."""
-    row = np.array([[*GAIN, *BIAS, FACTOR]], np.float32)[: int(exposed)]
-    targets = small_cloud.targets_of(IMAGE[..., :3], WEIGHT, np.zeros((0, 3), np.float32), BACK, row, np.float32(share))
-    return small_cloud.stepped(_camera(BENT), params, targets, pool)
+    exposure = np.array([*GAIN, *BIAS, FACTOR] if exposed else [], np.float32)
+    target = small_cloud.target_of(IMAGE[..., :3], WEIGHT, exposure=exposure, dissimilarity=np.float32(share))
+    return small_cloud.stepped(_camera(BENT), params, target, pool)
 
 
 def _at_the_fields_exposure() -> tuple[Tensor, Tensor]:
@@ -185,7 +185,7 @@ def test_a_quaternion_without_direction_is_no_rotation() -> None:
     plain = params.copy()
     plain[:, QUATERNION] = 1.0
     np.testing.assert_array_equal(_render(params, cam)[0], _render(plain, cam)[0])
-    gradient = small_cloud.stepped(cam, params, small_cloud.targets_of(IMAGE[..., :3]))[1]
+    gradient = small_cloud.stepped(cam, params, small_cloud.target_of(IMAGE[..., :3]))[1]
     assert np.isfinite(gradient).all() and not gradient[:, QUATERNION:OPACITY].any()
 
 
@@ -217,19 +217,19 @@ def test_a_tile_lists_the_gaussians_that_have_a_pixel_in_it_and_hardly_another(l
     params = random_params(300, seed=6)
     params[:, SCALE:QUATERNION] = np.log([0.01, 0.02, longest])
     raster = binned(_camera(lens), params)
-    lists, columns = raster.lists, int(raster.columns[0])
-    total = columns * int(raster.rows[0])
+    lists, columns = raster.lists, raster.columns
+    total = columns * raster.rows
     listed = np.zeros((len(params), total), bool)
     for t in range(total):
-        listed[lists.owner[0, lists.pair[0, lists.first[0, t] : lists.first[0, t + 1]]], t] = True
+        listed[lists.owner[lists.pair[lists.first[t] : lists.first[t + 1]]], t] = True
     x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     tile = (y // TILE).astype(int) * columns + (x // TILE).astype(int)
     touched, over_64 = np.zeros_like(listed), np.zeros(len(params), bool)
-    for i in np.flatnonzero(raster.tiles[0, : len(params), 1] > 0):
-        mx, my, a, b, c, alpha = raster.projected[0, i, :6].astype(np.float64)
+    for i in np.flatnonzero(raster.tiles[: len(params), 1] > 0):
+        mx, my, a, b, c, alpha = raster.projected[i, :6].astype(np.float64)
         power = -0.5 * (a * (x - mx) ** 2 + c * (y - my) ** 2) - b * (x - mx) * (y - my)
         touched[i, np.unique(tile[alpha * np.exp(power) >= 1.0 / 255.0])] = True
-        x0, x1, y0, y1 = raster.tiles[0, i, :4]
+        x0, x1, y0, y1 = raster.tiles[i, :4]
         over_64[i] = (x1 - x0) * (y1 - y0) > 64
     assert touched.sum() > 1000 and not (touched & ~listed).any()
     assert over_64.any() == (longest > 1.0)
@@ -241,37 +241,34 @@ def test_gaussians_beyond_what_memory_is_for_are_left_out_and_nothing_else(monke
     params = random_params(600, seed=6)
     params[:, SCALE:QUATERNION] = np.log(0.3)
     total = -(-LENS.width // TILE) * -(-LENS.height // TILE)
-    whole = binned(_camera(), params).lists.own_count[0, :600].astype(np.int64)
+    whole = binned(_camera(), params).lists.own_count[:600].astype(np.int64)
     monkeypatch.setattr(buffers, "MAX_PAIRS", 2500)
     for threads in (1, 3):
         raster = binned(_camera(), params, pool=Pool(threads, 0))
         lists, made = raster.lists, 0
-        room, listed = lists.pair.shape[1], int(lists.first[0, total])
-        assert lists.needed[0] == whole.sum() > room >= listed == lists.own_count[0, :600].sum() > 2000
+        room, listed = lists.pair.size, int(lists.first[total])
+        assert lists.needed[0] == whole.sum() > room >= listed == lists.own_count[:600].sum() > 2000
         for i, pairs in enumerate(whole):
             fits = made + pairs <= room
-            assert lists.own_count[0, i] == (pairs if fits else 0)
+            assert lists.own_count[i] == (pairs if fits else 0)
             made += pairs * fits
-        assert (np.sort(lists.pair[0, :listed]) == np.arange(listed)).all()
+        assert (np.sort(lists.pair[:listed]) == np.arange(listed)).all()
 
 
 # --- the optimizer step ---------------------------------------------------------------------------
 
 COUNT = 2 * BLOCK + 44  # two full blocks and a part of one
 STEP_LENS = Pinhole(48, 40, 50.0, 50.0, 24.0, 20.0, (-0.05, 0.01, 0.002, -0.001))
-EYES = ((1.0, -2.5, 0.8), (-2.0, 1.5, 1.0))
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-8
 
 
 def _raster(params: NDArray[np.float32]) -> tuple[RasterBuffers, NDArray[np.float32]]:
-    cams = camera_rows([look_at(eye, (0.05, 0.0, 0.1)) for eye in EYES], [STEP_LENS] * 2, BOX)
-    raster = binned(cams, params)
-    # Some are seen by one camera alone, every fifth by none.
-    raster.lists.own_count[0, :COUNT:3] = raster.lists.own_count[1, 1:COUNT:4] = 0
-    raster.lists.own_count[:, :COUNT:5] = 0
+    camera = _camera(STEP_LENS)
+    raster = binned(camera, params)
+    raster.lists.own_count[:COUNT:10] = raster.lists.own_count[BLOCK : 2 * BLOCK] = 0  # they are not seen
     rng = np.random.default_rng(4)
     raster.sums[...] = rng.normal(size=raster.sums.shape) * 0.01
-    return raster, cams
+    return raster, camera
 
 
 def _moments(width: int, filled: bool) -> OptimizerState:
@@ -292,17 +289,17 @@ def _adam_parameters(width: int, rate: float) -> AdamParameters:
 @pytest.mark.parametrize("sh_degree", [0, 1])
 def test_a_step_is_adams(sh_degree: int) -> None:
     params = random_params(COUNT, sh_degree, 3)
-    raster, cams = _raster(params)
+    raster, camera = _raster(params)
     width = params.shape[1]
     moments = _moments(width, filled=False)
-    raster.step(cams, as_gaussians(params.copy()), moments, _adam_parameters(width, 0.0))
+    raster.step(camera, as_gaussians(params.copy()), moments, _adam_parameters(width, 0.0))
     g = (moments.m / np.float32(1.0 - BETA1)).astype(np.float64)  # from Adam's first moment after one step from 0
-    seen = (raster.lists.own_count[:, :COUNT] > 0).any(axis=0)
+    seen = raster.lists.own_count[:COUNT] > 0
     assert 0 < (~seen).sum() < COUNT // 2 and (np.abs(g[seen]).max(axis=1) > 0).all()
     moments, after = _moments(width, filled=True), params.copy()
     before = OptimizerState(*(np.array(array, np.float64) for array in moments))
     rule = _adam_parameters(width, 1e-3)
-    assert raster.step(cams, as_gaussians(after), moments, rule) == 0
+    assert raster.step(camera, as_gaussians(after), moments, rule) == 0
 
     m = BETA1 * before.m + (1.0 - BETA1) * g
     v = BETA2 * before.v + (1.0 - BETA2) * g * g
@@ -322,14 +319,14 @@ def test_a_step_is_adams(sh_degree: int) -> None:
 def test_what_is_not_finite_is_dropped_and_counted(broken: float) -> None:
     """A sum of a color reaches that color alone: neither the number nor its moment moves."""
     params = random_params(COUNT, seed=3)
-    raster, cams = _raster(params)
-    victim = int(np.flatnonzero(raster.lists.own_count[0, :COUNT] > 0)[40])
+    raster, camera = _raster(params)
+    victim = int(np.flatnonzero(raster.lists.own_count[:COUNT] > 0)[40])
     rule, sound, hurt = _adam_parameters(BASE, 1e-3), params.copy(), params.copy()
-    raster.step(cams, as_gaussians(sound), _moments(BASE, filled=True), rule)
-    raster.sums[0, raster.lists.own_first[0, victim], 7] = broken
+    raster.step(camera, as_gaussians(sound), _moments(BASE, filled=True), rule)
+    raster.sums[raster.lists.own_first[victim], 7] = broken
     moments = _moments(BASE, filled=True)
     was = moments.m[victim, COLOR + 1]
-    assert raster.step(cams, as_gaussians(hurt), moments, rule) == 1
+    assert raster.step(camera, as_gaussians(hurt), moments, rule) == 1
     sound[victim, COLOR + 1] = params[victim, COLOR + 1]
     np.testing.assert_array_equal(hurt, sound)
     assert moments.m[victim, COLOR + 1] == was and np.isfinite(moments.v).all()

@@ -34,7 +34,7 @@ def case(count: int = 40, anchors: int = ANCHORS, seed: int = 0) -> tuple[np.nda
 
 def aligned(params, anchor, share, image, plate, weight, anchors=ANCHORS):
     raster = binned(CAMS, params, differentiate=False)
-    return align_view(raster, CAMS[0], params[:, :3], image, plate, weight, anchor, share, anchors)
+    return align_view(raster, CAMS, params[:, :3], image, plate, weight, anchor, share, anchors)
 
 
 def by_pixels(params, anchor, share, image, plate, weight, anchors=ANCHORS):
@@ -42,7 +42,7 @@ def by_pixels(params, anchor, share, image, plate, weight, anchors=ANCHORS):
     raster = binned(CAMS, params, differentiate=False)
     turn = CAMS[0, :9].reshape(3, 3).astype(float)
     x, y, z = turn @ (params[:, :3] - CAMS[0, 9:12]).T.astype(float)
-    rows = raster.projected[0].astype(float)
+    rows = raster.projected.astype(float)
     slope = np.stack(
         [LENS.fx / z * (turn[0] - np.outer(x / z, turn[2])).T, LENS.fy / z * (turn[1] - np.outer(y / z, turn[2])).T]
     )
@@ -53,8 +53,8 @@ def by_pixels(params, anchor, share, image, plate, weight, anchors=ANCHORS):
         for u in range(image.shape[1]):
             if weight[v, u] <= 0:
                 continue
-            t, light, used = v // 8 * int(raster.columns[0]) + u // 8, 1.0, []
-            for i in lists.owner[0, lists.pair[0, lists.first[0, t] : lists.first[0, t + 1]]]:
+            t, light, used = v // 8 * raster.columns + u // 8, 1.0, []
+            for i in lists.owner[lists.pair[lists.first[t] : lists.first[t + 1]]]:
                 row = rows[i]
                 dx, dy = u + 0.5 - row[MEAN_X], v + 0.5 - row[MEAN_Y]
                 form = row[CONIC_A] * dx * dx + 2 * row[CONIC_B] * dx * dy + row[CONIC_C] * dy * dy
@@ -110,5 +110,5 @@ def test_hard_gaussians_stay_finite():
     params[3, 10] = 80.0
     raster = RasterBuffers(Pool(1))
     raster.project_and_bin(CAMS, as_gaussians(params), differentiate=False)
-    for found in align_view(raster, CAMS[0], params[:, :3], image, plate, weight, anchor, share, ANCHORS):
+    for found in align_view(raster, CAMS, params[:, :3], image, plate, weight, anchor, share, ANCHORS):
         assert np.isfinite(found).all()
