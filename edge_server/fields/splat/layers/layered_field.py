@@ -336,7 +336,7 @@ class LayeredField:
     def _take(self, view: View) -> None:
         assert self.origin_ns is not None
         if view.camera not in self.cameras:
-            self.cameras[view.camera] = FixedCamera.begin(view, self.caller)
+            self.cameras[view.camera] = FixedCamera.begin(view)
         camera = self.cameras[view.camera]
         late = camera.is_late(view)
         camera.taken.append(view.generated_ns)
@@ -371,7 +371,7 @@ class LayeredField:
         """Begin a camera anew where it stands now, at the exposure that it had; the others go on."""
         log.info("%s stands somewhere else: its plate begins anew", view.camera)
         self.supervision.forget_camera(view.camera)
-        before, camera = self.cameras[view.camera], FixedCamera.begin(view, self.caller)
+        before, camera = self.cameras[view.camera], FixedCamera.begin(view)
         camera.taken, camera.moves, camera.anew, camera.began_ns = before.taken, before.moves, True, view.generated_ns
         camera.correct_exposure(before.plate.gain)
         self.cameras[view.camera] = camera

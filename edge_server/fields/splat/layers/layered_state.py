@@ -103,7 +103,7 @@ def unpack(field: Any, state: Arrays) -> None:
         image, pose = np.array(arrays["image"]), np.array(arrays["pose"])
         view = View(facts["camera"], image, pose, Pinhole(**lens), facts["generated_ns"])
         check_view(view)
-        plate = Plate(view.image.shape[0], view.image.shape[1], field.caller)
+        plate = Plate(view.image.shape[0], view.image.shape[1])
         plate.load_state(_under("plate.", arrays))
         fine = FinePlate.from_state(view, _under("fine.", arrays)) if "fine.color" in arrays else None
         camera = FixedCamera(view, plate, fine=fine, taken=deque(facts["taken"], maxlen=FRAMES_KNOWN))

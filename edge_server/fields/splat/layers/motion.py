@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.field_state import give_attributes, take_attributes
-from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.solve import BAND, PAIRS, add_row, add_span, solve_knots
 
@@ -72,7 +71,6 @@ class Motion:
 
     def __init__(self, radius_m: float, rng: np.random.Generator) -> None:
         self.radius_m, self.rng = radius_m, rng
-        self.pool: Pool = CallerPool()
         self.acceleration_m_per_s2, self.neighbor_m_per_s = tuned.ACCELERATION_M_PER_S2, tuned.NEIGHBOR_M_PER_S
         self.forget()
 
@@ -204,13 +202,11 @@ class Motion:
         self._band.fill(0.0)  # allocating it costs more: with 48 anchors it has 4 MB
         right = np.zeros((WINDOW, 3 * count))
         for span in spans:
-            self.pool.run(add_span, span.base, span.blocks, span.right, self._band, right)
+            add_span(span.base, span.blocks, span.right, self._band, right)
         knots = np.ascontiguousarray(self._knots.transpose(0, 2, 1)).reshape(WINDOW, -1)
         steady, alike = self._prior_weights()
         iterations = np.zeros(1, np.int64)
-        self.pool.run(
-            solve_knots, self._band, right, knots, tuned.FIXED, DIFFERENCES, steady, alike, self._laplacian, iterations
-        )
+        solve_knots(self._band, right, knots, tuned.FIXED, DIFFERENCES, steady, alike, self._laplacian, iterations)
         self._knots = np.ascontiguousarray(knots.reshape(WINDOW, 3, count).transpose(0, 2, 1))
         return len(rows) - sum(int(span.used[0]) for span in spans)
 
@@ -233,7 +229,7 @@ class Motion:
                 span = _Span(key, [], 0, blocks, right, np.zeros(1, np.int64))
             for row in group[len(span.rows) :]:
                 weights = self.weights(row.instant_s)[1]
-                self.pool.run(add_row, *row[1:], weights, span.blocks, span.right, span.used)
+                add_row(*row[1:], weights, span.blocks, span.right, span.used)
             self._spans.append(span._replace(rows=group, base=min(i - 1, WINDOW - BAND)))
         return self._spans
 

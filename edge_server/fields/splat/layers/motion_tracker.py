@@ -156,7 +156,7 @@ class MotionTracker:
             return []
         from edge_server.fields.splat.layers.depth.body_depth import measured_frames
 
-        return measured_frames(self.observations, self.cameras, self.moving.pool)
+        return measured_frames(self.observations, self.cameras)
 
     def _renew_anchors(self, instant_s: float) -> None:
         self.moving.renew_anchors(instant_s)

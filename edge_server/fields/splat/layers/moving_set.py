@@ -126,7 +126,6 @@ class MovingSet:
         rates = np.zeros(params.shape[1], np.float32)
         self.train(observation, camera, AdamParameters(rates, np.ones((1, 3), np.float32), np.float32(1.0)))
         self._inside([params[:, :3]], [observation], {observation.camera: camera}, 1)
-        self.motion.pool = self.pool
         assert observation.row is not None
         self.motion.slide(observation.instant_s + 1.0 / tuned.KNOTS_PER_S)
         self.motion.solve([observation.row])
@@ -185,7 +184,7 @@ class MovingSet:
             elif measured:
                 from edge_server.fields.splat.layers.depth.body_depth import seen_through
 
-                keep &= ~seen_through(places, frames, cameras, self.box, self.pool)
+                keep &= ~seen_through(places, frames, cameras, self.box)
             self._keep(keep)
 
     def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:

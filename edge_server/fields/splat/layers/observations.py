@@ -67,10 +67,10 @@ class FixedCamera:
     began_ns: int = 0
 
     @classmethod
-    def begin(cls, view: View, pool: Pool) -> FixedCamera:
-        """A camera that has shown nothing yet. view: its first frame. pool: runs the plate's kernels."""
+    def begin(cls, view: View) -> FixedCamera:
+        """A camera that has shown nothing yet. view: its first frame."""
         whole = None if view.whole is None else view.whole()
-        plate = Plate(view.image.shape[0], view.image.shape[1], pool)
+        plate = Plate(view.image.shape[0], view.image.shape[1])
         return cls(replace(view, whole=None, depth=None), plate, fine=None if whole is None else FinePlate(whole))
 
     def is_late(self, view: View) -> bool:

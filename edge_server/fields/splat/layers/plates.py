@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from edge_server.fields import View
 from edge_server.fields.common.field_state import give_attributes, load_arrays, take_attributes
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.plates import (
     MODES,
@@ -42,11 +41,10 @@ class Plate:
     count: number of frames taken in.
     """
 
-    def __init__(self, height: int, width: int, pool: Pool) -> None:
+    def __init__(self, height: int, width: int) -> None:
         def zeros(*shape: int) -> NDArray[np.float32]:
             return np.zeros((height, width, *shape), np.float32)
 
-        self.pool = pool
         self.arrays = PlateArrays(
             means=np.stack([zeros(3)] * MODES),
             blurred=np.stack([zeros(3)] * MODES),
@@ -106,8 +104,7 @@ class Plate:
         earlier = [self._recent[(self.count - lag) % len(self._recent)] for lag in tuned.LAGS]
         foreground, changing = masks = np.empty((2, *self.known.shape), np.uint8)
         counts = np.zeros(2, np.int64)
-        self.pool.run(
-            compare_with_plate,
+        compare_with_plate(
             image,
             self._blurred,
             self.arrays,
@@ -126,8 +123,7 @@ class Plate:
         elif may_refuse and counts[0] > tuned.REFUSED_SHARE * foreground.size:
             vars(self).update(before)  # what ``_scale`` has replaced
             return None
-        self.pool.run(
-            vote,
+        vote(
             image,
             self._blurred,
             self._difference,
@@ -174,7 +170,7 @@ class Plate:
         self._recent = []
         for frame, gain in zip(self._frames, self._gains, strict=True):
             blurred = np.empty(frame.shape, np.float32)
-            self.pool.run(blur, frame, blurred)
+            blur(frame, blurred)
             self._recent.append(blurred * gain)
 
     def _fill(self) -> None:
@@ -200,7 +196,7 @@ class Plate:
         if self.count == 0:
             return
         counts = np.zeros((3, 3), np.int64)
-        self.pool.run(count_exposure, image, self.arrays, counts)
+        count_exposure(image, self.arrays, counts)
         used = counts[:, 0]
         few = used[0] < tuned.GAIN_SHARE * image.shape[0] * image.shape[1] / 4
         # The median is beyond a bound if more than half of the ratios are.

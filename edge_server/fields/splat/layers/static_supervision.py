@@ -79,7 +79,7 @@ class StaticSupervision:
         assert view.depth is not None
         plate = self.make_depth_plate(camera)
         before = plate.refused
-        taken = plate.take(view.depth, foreground, camera.plate.pool)
+        taken = plate.take(view.depth, foreground)
         if not taken and before == 0:
             log.warning("%s: its depth contradicts what it measured before, and is left out", view.camera)
         return taken and self.trusts_depth(view.camera)

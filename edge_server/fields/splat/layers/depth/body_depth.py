@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.optimizer_step import clamp_gaussians
 from edge_server.fields.splat.kernels.project import COLOR, OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
@@ -19,7 +18,7 @@ from edge_server.fields.splat.layers.depth.kernels.body_depth import count_seen_
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
 
 
-def measured_frames(observations: Observations, cameras: dict[str, FixedCamera], pool: Pool) -> list[Observation]:
+def measured_frames(observations: Observations, cameras: dict[str, FixedCamera]) -> list[Observation]:
     """The newest frame with depth of each camera, oldest first, with ``Observation.body_m``; none where these frames
     measured nothing that moves."""
     newest: dict[str, Observation] = {}
@@ -28,12 +27,12 @@ def measured_frames(observations: Observations, cameras: dict[str, FixedCamera],
             newest[o.camera] = o
     for o in newest.values():
         if o.body_m is None:
-            o.body_m = body_depth(o, cameras[o.camera], pool)
+            o.body_m = body_depth(o, cameras[o.camera])
     pixels = sum(int((o.body_m > 0.0).sum()) for o in newest.values() if o.body_m is not None)
     return sorted(newest.values()) if pixels >= tuned.BODY_PIXELS else []
 
 
-def body_depth(observation: Observation, camera: FixedCamera, pool: Pool) -> NDArray[np.float32]:
+def body_depth(observation: Observation, camera: FixedCamera) -> NDArray[np.float32]:
     """Depth of what moves in a frame, float32 (H, W), in the frame's meters, 0 elsewhere."""
     depth, image, plate = observation.view.depth, observation.view.image, camera.depth
     assert depth is not None and plate is not None
@@ -42,7 +41,7 @@ def body_depth(observation: Observation, camera: FixedCamera, pool: Pool) -> NDA
     # color is known, it is too far or too dark to be measured: what is measured there is nearer.
     tells = camera.plate.known | (plate.count >= tuned.LEAST)
     where, color = observation.foreground & tells, camera.plate.picture
-    pool.run(measure_body, depth, where, image, color, plate.samples, plate.count, inverse, body)
+    measure_body(depth, where, image, color, plate.samples, plate.count, inverse, body)
     return body
 
 
@@ -70,11 +69,7 @@ def seed_at_depth(
 
 
 def seen_through(
-    places: Sequence[NDArray[np.float32]],
-    frames: Sequence[Observation],
-    cameras: dict[str, FixedCamera],
-    box: SceneBox,
-    pool: Pool,
+    places: Sequence[NDArray[np.float32]], frames: Sequence[Observation], cameras: dict[str, FixedCamera], box: SceneBox
 ) -> NDArray[np.bool_]:
     """Whether a frame measured something behind each Gaussian, bool (N,).
 
@@ -85,5 +80,5 @@ def seen_through(
         if o.view.depth is not None:
             camera = cameras[o.camera]
             scale = np.float32(camera.depth_scale / box.radius_m)
-            pool.run(count_seen_through, camera.row, points, o.view.depth, scale, through)
+            count_seen_through(camera.row, points, o.view.depth, scale, through)
     return through > 0

@@ -44,7 +44,7 @@ class DepthPlate:
         """A plate of a camera that has measured nothing yet."""
         return cls(np.zeros((height, width, tuned.KEPT), np.float32), np.zeros((height, width), np.int32))
 
-    def take(self, depth: NDArray[np.float32], foreground: NDArray[np.bool_], pool: Pool) -> bool:
+    def take(self, depth: NDArray[np.float32], foreground: NDArray[np.bool_]) -> bool:
         """Take in the depth of a frame, see ``kernels.depth_plate.remember_depths``.
 
         Returns False, and takes nothing in, if it contradicts what was measured before. After MOST_REFUSED such images
@@ -57,7 +57,7 @@ class DepthPlate:
                 return False
             self.count[:] = 0
         self.refused = 0
-        pool.run(remember_depths, depth, foreground, self.samples, self.count)
+        remember_depths(depth, foreground, self.samples, self.count)
         return True
 
     def _contradicts(self, depth: NDArray[np.float32], foreground: NDArray[np.bool_]) -> bool:

@@ -274,13 +274,13 @@ def _run_kernels(pool: Pool) -> None:
     plate = PlateImage(view, np.zeros((*shape, 3), np.float32), np.ones(shape, bool))
     depth = DepthPlate.empty(*shape)
     for _ in range(tuned.LEAST):
-        depth.take(np.ones(shape, np.float32), np.zeros(shape, bool), pool)
+        depth.take(np.ones(shape, np.float32), np.zeros(shape, bool))
     DepthSupervision(SplatSettings(), pool).plates([CameraPlates(plate, plate, depth, np.eye(4))], anew=True)
     box = scene_box([view])
-    camera = FixedCamera(view, Plate(*shape, pool), row=camera_rows([np.eye(4)], [lens], box), depth=depth)
+    camera = FixedCamera(view, Plate(*shape), row=camera_rows([np.eye(4)], [lens], box), depth=depth)
     frame = Observation(0.0, "warm-up", replace(view, depth=depth.samples[..., 0].copy()), np.ones(shape, bool))
-    frame.body_m = body_depth(frame, camera, pool)
-    seen_through([np.zeros((1, 3), np.float32)], [frame], {"warm-up": camera}, box, pool)
+    frame.body_m = body_depth(frame, camera)
+    seen_through([np.zeros((1, 3), np.float32)], [frame], {"warm-up": camera}, box)
     aside = np.eye(4)
     aside[0, 3] = 0.5
     nothing = np.zeros(shape, np.float32)

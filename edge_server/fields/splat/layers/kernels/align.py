@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import LENS, NEAR, lens_terms, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
-from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.common.kernels.simd_vectors import (
     LANES,
     Vector,
@@ -66,9 +65,7 @@ def align_view(
     """
     matrix, vector = np.empty((3 * anchors, 3 * anchors)), np.empty(3 * anchors)
     shown, opacity = np.empty(image.shape, np.float32), np.empty(image.shape[:2], np.float32)
-    raster.pool.run(
-        add_view, image, plate, weight, raster.raster, camera, places, anchor, share, matrix, vector, shown, opacity
-    )
+    add_view(image, plate, weight, raster.raster, camera, places, anchor, share, matrix, vector, shown, opacity)
     return matrix, vector, shown, opacity
 
 
@@ -253,12 +250,8 @@ def _heaviest(image, plate, weight, x0, y0, behind):
 
 
 @kernel
-def add_view(
-    counter, worker, image, plate, weight, raster, cams, places, anchor, share, matrix, vector, shown, opacity
-):
-    """See ``align_view``; one task, so that sums do not depend on the number of threads."""
-    if draw(counter, worker, 1) >= 1:
-        return
+def add_view(image, plate, weight, raster, cams, places, anchor, share, matrix, vector, shown, opacity):
+    """See ``align_view``."""
     height, width, anchors, lists = image.shape[0], image.shape[1], vector.size // 3, raster.lists
     for y in range(height):
         for x in range(width):

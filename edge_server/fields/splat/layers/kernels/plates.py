@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
-from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.masks import clean_mask
 
@@ -86,14 +85,14 @@ def _blur(image, blurred):
 
 
 @kernel
-def blur(counter, worker, image, blurred):
+def blur(image, blurred):
     """Blur a frame, uint8 (H, W, 3), into float32 (H, W, 3)."""
     _blur(image, blurred)
 
 
 @kernel
 def compare_with_plate(
-    counter, worker, image, blurred, plate, earlier, lags, static, has_static, difference, flags, eights, masks, counts
+    image, blurred, plate, earlier, lags, static, has_static, difference, flags, eights, masks, counts
 ):
     """Blur a frame, compare it with the plate and with earlier frames, and clean what differs.
 
@@ -193,22 +192,7 @@ def _is_known(weight, total):
 
 
 @kernel
-def vote(
-    counter,
-    worker,
-    image,
-    blurred,
-    difference,
-    flags,
-    foreground,
-    changing,
-    trusts,
-    held,
-    plate,
-    static,
-    has_static,
-    picture,
-):
+def vote(image, blurred, difference, flags, foreground, changing, trusts, held, plate, static, has_static, picture):
     """Update the plate by a frame.
 
     image: uint8 (H, W, 3). blurred, difference, flags: as in ``compare_with_plate``.
@@ -274,15 +258,13 @@ def vote(
 
 
 @kernel
-def count_exposure(counter, worker, image, plate, counts):
+def count_exposure(image, plate, counts):
     """Count the pixels where a frame is brighter or darker than the plate, among every fourth pixel of the
     known and well exposed plate.
 
     counts: int64 (3, 3), written, for each channel: pixels, those brighter and those darker than the plate by
         more than GAIN_STEP.
     """
-    if fetch_add(counter, 1) > 0:
-        return
     counts[:] = 0
     high, low = np.float32(1.0 + tuned.GAIN_STEP), np.float32(1.0 - tuned.GAIN_STEP)
     for y in range(0, image.shape[0], 2):

@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields.common.kernels.jit import device_function, kernel
-from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.splat.layers.layer_constants import MOST_ITERATIONS, TOLERANCE
 
 BAND = 4  # knots that one view bears on
@@ -21,15 +20,13 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
 @kernel
-def add_row(counter, worker, matrix, vector, around, weights, blocks, right, used):
+def add_row(matrix, vector, around, weights, blocks, right, used):
     """Add one view to the sums of views between the same two knots.
 
     matrix, vector, around: see ``motion.ViewRow``. weights: float64 (BAND,), of the knots at its instant.
     blocks: float32 (PAIRS, n, n), normal matrix of each pair of knots. right: float64 (BAND, n).
     used: int64 (1,), 1 is added; nothing is added for a view with numbers that are not finite.
     """
-    if draw(counter, worker, 1) >= 1:
-        return
     n, anchors = vector.size, vector.size // 3
     turned, totals, good = np.empty((n, n), np.float32), np.empty(n), True
     for a in range(anchors):
@@ -61,11 +58,9 @@ def add_row(counter, worker, matrix, vector, around, weights, blocks, right, use
 
 
 @kernel
-def add_span(counter, worker, base, blocks, right, band, total):
+def add_span(base, blocks, right, band, total):
     """Add the sums of a span of time, whose first knot is ``base``, to the band (T, BAND, n, n) of blocks
     (k, k + q), and to the right side ``total``, float64 (T, n)."""
-    if draw(counter, worker, 1) >= 1:
-        return
     n, pair = total.shape[1], 0
     for i in range(BAND):
         for p in range(n):
@@ -197,7 +192,7 @@ def _dot(a, b):
 
 
 @kernel
-def solve_knots(counter, worker, band, right, knots, fixed, differences, steady, alike, laplacian, iterations):
+def solve_knots(band, right, knots, fixed, differences, steady, alike, laplacian, iterations):
     """Improve the knots after the first ``fixed`` until they solve the least squares.
 
     band: float32 (T, BAND, n, n), blocks (k, k + q) of the views' normal matrix. right: float64 (T, n).
@@ -205,8 +200,6 @@ def solve_knots(counter, worker, band, right, knots, fixed, differences, steady,
     differences: float64 (BAND,), of the prior in time; steady, alike: its weight, and that of neighbors.
     laplacian: float64 (K, K), of the neighbors' graph. iterations: int64 (1,), written.
     """
-    if draw(counter, worker, 1) >= 1:
-        return
     shape, n = knots.shape, knots.shape[1]
     # The residual in float64: what is left for float32 is a small step.
     y = np.zeros(shape)

@@ -195,9 +195,9 @@ def _seen_from(k: int) -> tuple[FixedCamera, Observation]:
     image, ball_m = seen(view.intrinsics, pose)
     still_m, depth = (np.where(np.isfinite(m), m * axis, 0).astype(np.float32) for m in (far_m, ball_m))
     row = camera_rows([pose], [view.intrinsics], BOX)
-    camera = FixedCamera(view, Plate(*image.shape[:2], POOL), row=row, depth=DepthPlate.empty(*depth.shape))
+    camera = FixedCamera(view, Plate(*image.shape[:2]), row=row, depth=DepthPlate.empty(*depth.shape))
     for _ in range(3):
-        camera.depth.take(still_m, np.zeros(depth.shape, bool), POOL)
+        camera.depth.take(still_m, np.zeros(depth.shape, bool))
     camera.plate.picture = empty.astype(np.float32)
     camera.plate.known[:] = True
     return camera, Observation(INSTANT_S, view.camera, replace(view, depth=depth), (image != empty).any(axis=2))
@@ -298,7 +298,7 @@ def _measured(cameras: dict[str, FixedCamera], frames: list[Observation]) -> lis
     observations = Observations()
     for o in frames:
         observations.add(o)
-    return measured_frames(observations, cameras, POOL)
+    return measured_frames(observations, cameras)
 
 
 @pytest.mark.parametrize(("known", "scale"), [(0, 1.0), (40, 1.0), (0, 0.9)])

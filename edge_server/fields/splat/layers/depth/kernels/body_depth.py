@@ -10,7 +10,6 @@ import numpy as np
 
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, lens_terms, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import kernel
-from edge_server.fields.common.kernels.simd import draw
 from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.kernels.depth_plate import insert_sorted, pixel_median
 
@@ -20,16 +19,14 @@ _F0, _F1 = np.float32(0.0), np.float32(1.0)
 
 
 @kernel
-def measure_body(counter, worker, depth, foreground, image, plate, samples, count, inverse, body):
-    """Depth of the foreground's pixels that measured something in front of the plate, smoothed. One task.
+def measure_body(depth, foreground, image, plate, samples, count, inverse, body):
+    """Depth of the foreground's pixels that measured something in front of the plate, smoothed.
 
     depth: float32 (H, W), meters. foreground: bool (H, W). image: uint8 (H, W, 3).
     plate: float32 (H, W, 3), of 255. samples, count: of its depth, see ``depth_plate.remember_depths``.
     inverse: float32 (H, W), written: 1 / depth of the pixels used, 0 elsewhere.
     body: float32 (H, W), written: meters, 0 where nothing that moves was measured.
     """
-    if draw(counter, worker, 1) >= 1:
-        return
     height, width = depth.shape
     ranked = np.empty(samples.shape[2], np.float32)
     for y in range(height):
@@ -71,16 +68,14 @@ def measure_body(counter, worker, depth, foreground, image, plate, samples, coun
 
 
 @kernel
-def count_seen_through(counter, worker, cams, points, depth, scale, through):
-    """Count a frame for the points behind which it measured. One task.
+def count_seen_through(cams, points, depth, scale, through):
+    """Count a frame for the points behind which it measured.
 
     cams: float32 (1, CAMERA). points: float32 (N, 3), scene units. depth: float32 (H, W), meters.
     scale: scene units a meter of ``depth``.
     through: int32 (N,), increased by 1 where the 3 x 3 pixels about a point measured, and all of them measured
         something behind it.
     """
-    if draw(counter, worker, 1) >= 1:
-        return
     cam = load_camera(cams, 0)
     height, width = depth.shape
     margin, share = np.float32(tuned.BODY_THROUGH_M), np.float32(1.0 + tuned.BODY_THROUGH)

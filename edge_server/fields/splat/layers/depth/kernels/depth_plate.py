@@ -17,24 +17,20 @@ _FARTHEST_M = np.float32(1e6)  # no sensor measures farther: a larger number is 
 
 
 @kernel
-def remember_depths(counter, worker, depth, foreground, samples, count):
-    """Add an image of depth to the last ones of each pixel. Tasks are runs of rows.
+def remember_depths(depth, foreground, samples, count):
+    """Add an image of depth to the last ones of each pixel.
 
     depth: float32 (H, W), meters; what is not a positive finite number was not measured.
     foreground: bool (H, W), pixels that do not show the plate.
     samples: float32 (H, W, KEPT), a ring of inverse depths. count: int32 (H, W), depths ever taken in.
     """
     height, width, kept = samples.shape
-    while True:
-        top = fetch_add(counter, 1) * _ROWS
-        if top >= height:
-            return
-        for y in range(top, min(top + _ROWS, height)):
-            for x in range(width):
-                z = depth[y, x]
-                if (z > _F0) & (z < _FARTHEST_M) & (not foreground[y, x]):
-                    samples[y, x, count[y, x] % kept] = _F1 / z
-                    count[y, x] += 1
+    for y in range(height):
+        for x in range(width):
+            z = depth[y, x]
+            if (z > _F0) & (z < _FARTHEST_M) & (not foreground[y, x]):
+                samples[y, x, count[y, x] % kept] = _F1 / z
+                count[y, x] += 1
 
 
 @device_function

@@ -53,7 +53,7 @@ def test_medians_are_those_of_numpy() -> None:
     plate = DepthPlate.empty(9, 11)
     for _ in range(40):
         depth = rng.uniform(1.0, 1.0 + rng.random((9, 11)) * 0.3).astype(np.float32)
-        plate.take(np.where(rng.random((9, 11)) < 0.6, depth, 0).astype(np.float32), rng.random((9, 11)) < 0.2, POOL)
+        plate.take(np.where(rng.random((9, 11)) < 0.6, depth, 0).astype(np.float32), rng.random((9, 11)) < 0.2)
     assert plate.count.max() > tuned.KEPT and plate.is_known(np.ones((9, 11), bool))
     found = plate.medians(POOL)
     assert (found == 0).any() and (found > 0).any()
@@ -102,7 +102,7 @@ def test_what_no_sensor_measures_is_no_depth() -> None:
     plate = DepthPlate.empty(2, 4)
     broken = np.array([[np.nan, np.inf, -np.inf, -1.0], [0.0, -0.0, 1e9, 3.0]], np.float32)
     for _ in range(5):
-        plate.take(broken, np.zeros((2, 4), bool), POOL)
+        plate.take(broken, np.zeros((2, 4), bool))
     found = plate.medians(POOL)
     np.testing.assert_allclose(found, [[0, 0, 0, 0], [0, 0, 0, 1 / 3]], rtol=1e-6)
     assert np.isfinite(smooth(found, np.zeros((2, 4, 3), np.float32), POOL)[0]).all()
@@ -113,16 +113,16 @@ def test_what_no_sensor_measures_is_no_depth() -> None:
 def test_depth_of_another_unit_is_refused_until_it_stays(factor: float) -> None:
     depth, nothing = np.full((24, 24), 2.0, np.float32), np.zeros((24, 24), bool)
     plate, pool = DepthPlate.empty(24, 24), CallerPool()
-    assert all(plate.take(depth, nothing, pool) for _ in range(4))
+    assert all(plate.take(depth, nothing) for _ in range(4))
     # A person in the middle is no other unit, nor are holes.
     near = depth.copy()
     near[8:16] = 0.8
     near[16:20] = 0.0
-    assert plate.take(near, nothing, pool)
+    assert plate.take(near, nothing)
     wrong = depth * np.float32(factor)
-    assert not any(plate.take(wrong, nothing, pool) for _ in range(tuned.MOST_REFUSED))
+    assert not any(plate.take(wrong, nothing) for _ in range(tuned.MOST_REFUSED))
     np.testing.assert_allclose(plate.medians(pool), 0.5)
-    assert all(plate.take(wrong, nothing, pool) for _ in range(4)) and plate.refused == 0
+    assert all(plate.take(wrong, nothing) for _ in range(4)) and plate.refused == 0
     np.testing.assert_allclose(plate.medians(pool), 0.5 / factor, rtol=1e-5)
 
 
@@ -143,7 +143,7 @@ def _body_depth(depth: np.ndarray, plate_depth: np.ndarray, seed: int = 0) -> tu
     samples = np.where(known, 1.0 / np.where(known, plate_depth, 1.0), 0.0)[..., None].repeat(3, axis=2)
     samples[unsteady] = 0.2, 0.4, 0.6
     count = np.where(known | unsteady, 3, 2).astype(np.int32)
-    POOL.run(measure_body, depth, foreground, image, plate, samples.astype(np.float32), count, inverse, found)
+    measure_body(depth, foreground, image, plate, samples.astype(np.float32), count, inverse, found)
     off = np.abs(image.astype(np.float32) - plate).max(axis=2)
     with np.errstate(all="ignore"):
         nearer = (plate_depth <= 0) | (depth < plate_depth - np.maximum(NEARER_M, NEARER * plate_depth))

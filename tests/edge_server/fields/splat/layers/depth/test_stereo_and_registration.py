@@ -78,7 +78,7 @@ def test_a_camera_that_joins_is_registered_with_the_others() -> None:
         view = View(f"cam{k:02d}", surface.color.astype(np.uint8), surface.pose, surface.lens)
         plate, measured = PlateImage(view, surface.color, surface.known), DepthPlate.empty(SIZE, SIZE)
         for _ in range(tuned.LEAST):
-            measured.take(surface.depth(), np.zeros((SIZE, SIZE), bool), shared_pool())
+            measured.take(surface.depth(), np.zeros((SIZE, SIZE), bool))
         cameras.append(CameraPlates(plate, plate, measured, surface.pose))
     depth = DepthSupervision(SplatSettings(), shared_pool())
     depth.plates(cameras[:2], anew=True)

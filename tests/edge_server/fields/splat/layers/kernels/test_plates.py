@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from edge_server.fields.common.kernels.jit import kernel
-from edge_server.fields.common.threads.thread_pool import CallerPool
 from edge_server.fields.splat.layers.kernels import plates
 from edge_server.fields.splat.layers.kernels.masks import clean_mask
 from edge_server.fields.splat.layers.kernels.plates import MODES, PlateArrays, blur, compare_with_plate, vote
@@ -98,7 +97,7 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
     for count in (0, 1, 2):
         for has_static in (False, True):
             given = (image, blurred, plate, tuple(earlier), count, static, has_static, difference)
-            CallerPool().run(compare_with_plate, *given, flags, flags.view(np.uint64), masks, counts)
+            compare_with_plate(*given, flags, flags.view(np.uint64), masks, counts)
             np.testing.assert_allclose(blurred, cv2.boxFilter(image, cv2.CV_32F, (3, 3)), rtol=1e-6)
             changing = np.zeros((H, W), bool)
             for k in range(count):
@@ -122,7 +121,7 @@ def test_a_frame_is_compared_with_plate_earlier_frames_and_static_field() -> Non
 def test_frames_of_any_size_are_blurred(shape: tuple[int, int]) -> None:
     image = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
     blurred = np.empty((*shape, 3), np.float32)
-    CallerPool().run(blur, image, blurred)
+    blur(image, blurred)
     np.testing.assert_allclose(blurred, cv2.boxFilter(image, cv2.CV_32F, (3, 3)), rtol=1e-6)
 
 
@@ -164,7 +163,7 @@ def test_votes(trusts: bool) -> None:
     if trusts:
         votes |= (flags & plates.LIKE_STATIC > 0) & (foreground == 0)
     frame = (image, blurred, difference, flags, foreground, changing)
-    CallerPool().run(vote, *frame, trusts, held, found, static, True, picture)
+    vote(*frame, trusts, held, found, static, True, picture)
     for y in range(H):
         for x in range(W):
             if held[y, x]:
@@ -191,7 +190,7 @@ def test_exposure_is_counted_where_the_plate_tells_it() -> None:
     plate, counts = _plate(5), np.zeros((3, 3), np.int64)
     plate.means[:, :10] = 10.0  # too dark
     image = np.clip(plate.means[0] * [1.0, 1.1, 0.9] + 0.5, 0, 255).astype(np.uint8)
-    CallerPool().run(plates.count_exposure, image, plate, counts)
+    plates.count_exposure(image, plate, counts)
     used = plate.known[::2, ::2][5:].sum()
     np.testing.assert_array_equal(counts, [[used, 0, 0], [used, used, 0], [used, 0, used]])
 
@@ -206,7 +205,7 @@ BODY = slice(16, 32)
 @pytest.mark.parametrize("explained", ["nothing", "the body", "by fields not asked"])
 def test_a_body_that_stays_becomes_the_plate_unless_what_moves_explains_it(explained: str) -> None:
     """Of fields learned from plates that are not certain nothing is asked: they would confirm what is wrong there."""
-    plate, by_itself = Plate(SIZE, SIZE, CallerPool()), explained == "by fields not asked"
+    plate, by_itself = Plate(SIZE, SIZE), explained == "by fields not asked"
     opacity = np.zeros((SIZE, SIZE), np.float32)
     opacity[BODY, 20:30] = 1.0  # of a moving set that shows the body
     for _ in range(12):
@@ -228,7 +227,7 @@ def test_a_body_that_stays_becomes_the_plate_unless_what_moves_explains_it(expla
 
 
 def test_what_is_unknown_shows_and_is_compared_with_the_static_field() -> None:
-    plate, image = Plate(SIZE, SIZE, CallerPool()), WALL.copy()
+    plate, image = Plate(SIZE, SIZE), WALL.copy()
     for k in range(20):
         image[:, 30:] = (40, 220)[k % 2]
         plate.take(image)
@@ -279,7 +278,7 @@ def test_plain_is_what_changes_by_less_than_two_steps_within_nine_pixels() -> No
 
 def test_a_plate_takes_images_that_are_views_of_others_and_loads_no_state_of_other_images() -> None:
     image = np.random.default_rng(0).integers(0, 256, (SIZE, SIZE, 3), np.uint8)
-    one, other = Plate(SIZE, SIZE, CallerPool()), Plate(SIZE, SIZE, CallerPool())
+    one, other = Plate(SIZE, SIZE), Plate(SIZE, SIZE)
     for _ in range(4):
         one.take(image[::-1, :, ::-1])
         other.take(image[::-1, :, ::-1].copy())
@@ -288,4 +287,4 @@ def test_a_plate_takes_images_that_are_views_of_others_and_loads_no_state_of_oth
         np.testing.assert_array_equal(state[name], array)
     for name in ("weight", "total", "run", "deviation", "_held", "_frames"):
         with pytest.raises(ValueError, match=f"lacks '{name}'"):
-            Plate(SIZE, SIZE, CallerPool()).load_state(state | {name: state[name][..., :-1, :]})
+            Plate(SIZE, SIZE).load_state(state | {name: state[name][..., :-1, :]})
