@@ -122,7 +122,7 @@ class Exporter:
         snapshot: Any = self._field.snapshot()
         if not hasattr(snapshot, "gaussians"):
             raise ExportError(f"--splats: {self._name} has no Gaussians: use a run or fit of field splat")
-        self._say(f"{path}: {write_splats(path, snapshot.gaussians, snapshot.box)} Gaussians")
+        self._say(f"{path}: {write_splats(path, snapshot.params, snapshot.box)} Gaussians")
 
     def _colmap(self, folder: Path) -> None:
         from edge_server.export.colmap import write_model

@@ -8,7 +8,6 @@ from edge_server.export import ExportError
 from edge_server.export.export_constants import FRAMES_PER_S, GAP_S
 from edge_server.export.splats import write_splats
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.page.splats.messages import MessageError, SceneBlock, StreamReader, read_saved
 
 
@@ -36,8 +35,7 @@ def write_sequence(path: Path, stream: Path) -> int:
         if abs(reader.instant_s - due_s) > GAP_S:
             due_s = reader.instant_s
         while due_s <= reader.instant_s:
-            gaussians = Gaussians(reader.at(due_s), 0)
-            write_splats(path.with_stem(f"{path.stem}-{count:04d}"), gaussians, box_of(reader.scene))
+            write_splats(path.with_stem(f"{path.stem}-{count:04d}"), reader.at(due_s), box_of(reader.scene))
             count, due_s = count + 1, due_s + 1.0 / FRAMES_PER_S
     if count == 0:
         raise ExportError(f"{stream}: holds no Gaussians: is it what the button save of the page /splats/ wrote?")

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from edge_server.export import ExportError
 from edge_server.export.ply import write_table
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE, Gaussians
+from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, POSITION, QUATERNION, SCALE
 from edge_server.fields.splat.planar import unit_quaternions
 from edge_server.fields.splat.splat_constants import LOG_SCALE_HIGH, LOG_SCALE_LOW
 from freshfield.files import write_bytes
@@ -28,9 +28,9 @@ Y0 = 0.28209479177387814
 SIGNS = np.array([-1, 1, -1], np.float32)
 
 
-def write_splats(path: Path, gaussians: Gaussians, box: SceneBox) -> int:
-    """Write all Gaussians; returns their number. ExportError: there are none."""
-    table = splat_table(gaussians, box)
+def write_splats(path: Path, params: NDArray[np.float32], box: SceneBox) -> int:
+    """Write Gaussians of parameters (N, P); returns their number. ExportError: there are none."""
+    table = splat_table(params, box)
     if not len(table):
         raise ExportError("the field has no Gaussians yet: fit it first")
     if path.suffix.lower() == ".spz":
@@ -76,9 +76,9 @@ def import_gsply() -> Any:
     return gsply
 
 
-def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:
+def splat_table(params: NDArray[np.float32], box: SceneBox) -> NDArray[np.void]:
     """The rows (N,) of the file, in world meters."""
-    p, extra = gaussians.params.astype(np.float64), 3 * gaussians.sh_degree
+    p, extra = params.astype(np.float64), (params.shape[1] - BASE) // 3
     rest = p[:, BASE:].reshape(len(p), extra, 3) * SIGNS[:extra, None]
     columns = {
         **_three("xyz", p[:, POSITION:SCALE] * box.radius_m + np.array(box.center_m)),
@@ -92,7 +92,7 @@ def splat_table(gaussians: Gaussians, box: SceneBox) -> NDArray[np.void]:
             np.clip(p[:, SCALE:QUATERNION], LOG_SCALE_LOW, LOG_SCALE_HIGH) + np.log(box.radius_m),
         ),
     }
-    turn = unit_quaternions(gaussians.params)
+    turn = unit_quaternions(params)
     columns |= {f"rot_{k}": turn[:, k] for k in range(4)}
     table = np.zeros(len(p), dtype=[(name, "<f4") for name in columns])
     for name, values in columns.items():

@@ -31,20 +31,20 @@ def information(
 ) -> Iterator[NDArray[np.float32]]:
     """The diagonal of the Fisher information about N Gaussians of P parameters, float32 (N, P), for each camera in
     turn: the sum over pixels and colors of squared derivatives, as ``images`` random images estimate it."""
-    gaussians = snapshot.copied().gaussians  # a step clamps them
-    count, width = gaussians.params.shape
+    params = snapshot.params.copy()  # a step clamps them
+    count, width = params.shape
     raster, still = RasterBuffers(snapshot.pool), np.zeros(width, np.float32)
     rule = AdamParameters(still, age_corrections(), np.float32(1.0))
     for pose, lens in zip(poses, lenses):
         camera, size = camera_rows([pose], [lens], snapshot.box), (lens.height, lens.width, 3)
-        raster.project_and_bin(camera, gaussians)
+        raster.project_and_bin(camera, params)
         rng, gradients = np.random.default_rng(0), np.empty((images, count, width), np.float32)
         for gradient in gradients:
             image = rng.integers(2, size=size, dtype=np.uint8) * np.uint8(255)
             raster.train(Target(image, np.zeros((0, 0), np.float32), snapshot.background))
             sums = (np.zeros(count, np.float32) for _ in range(3))
             first, second = np.zeros((2, count, width), np.float32)
-            raster.step(camera, gaussians, OptimizerState(first, second, np.zeros(count, np.int32), *sums), rule)
+            raster.step(camera, params, OptimizerState(first, second, np.zeros(count, np.int32), *sums), rule)
             gradient[:] = first / (1.0 - BETA1)  # Adam's first moment after one step
         yield gradients.var(axis=0, ddof=1)
 
@@ -63,7 +63,7 @@ class FisherRF:
         if not isinstance(snapshot, SplatSnapshot):
             raise ViewpointError("fisher: it needs a field of Gaussians: splat")
         poses, lens = state.candidates.poses, state.candidates.lens
-        known = np.zeros(snapshot.gaussians.params.shape)
+        known = np.zeros(snapshot.params.shape)
         for row in information(snapshot, [v.camera_to_world for v in state.views], [v.intrinsics for v in state.views]):
             known += row
         if len(known):  # without a view there is no Gaussian

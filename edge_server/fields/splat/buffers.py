@@ -10,7 +10,7 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.kernels.bin_tiles import TileLists, bin_tiles
 from edge_server.fields.splat.kernels.composite import PIXELS, SAVED, STRIPS, SUMS
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState, adam_step
-from edge_server.fields.splat.kernels.project import BLOCK, FOOTPRINT, PROJECTED, TILE, Gaussians, project
+from edge_server.fields.splat.kernels.project import BLOCK, FOOTPRINT, PROJECTED, TILE, project
 from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, ROWS, Raster, Target, train_tiles
 from edge_server.fields.splat.splat_constants import MAX_PAIRS
 
@@ -39,16 +39,18 @@ class RasterBuffers:
         """What the kernels read of the last ``project_and_bin``."""
         return Raster(self.columns, self.rows, self.projected, self.lists, self.memory, self.saved)
 
-    def project_and_bin(self, camera: NDArray[np.float32], gaussians: Gaussians, differentiate: bool = True) -> None:
-        """Project the Gaussians into a camera, and list them by tile.
+    def project_and_bin(
+        self, camera: NDArray[np.float32], params: NDArray[np.float32], differentiate: bool = True
+    ) -> None:
+        """Project Gaussians into a camera, and list them by tile.
 
-        camera: float32 (1, CAMERA), see ``camera_rows``.
+        camera: float32 (1, CAMERA), see ``camera_rows``. params: float32 (N, P), see ``kernels.project``.
         differentiate: whether to make room for gradients.
         """
-        count = len(gaussians.params)
+        count = len(params)
         self.columns, self.rows = (-(-int(size) // TILE) for size in camera[0, SIZE : SIZE + 2])
         self._allocate(count, self.columns * self.rows)
-        self.pool.run(project, camera, gaussians, count, self.projected, self.tiles)
+        self.pool.run(project, camera, params, count, self.projected, self.tiles)
         self._bin(count)
         pairs = min(int(self.lists.needed[0]), MAX_PAIRS)
         if pairs > self.lists.pair.size:
@@ -75,22 +77,22 @@ class RasterBuffers:
     def step(
         self,
         camera: NDArray[np.float32],
-        gaussians: Gaussians,
+        params: NDArray[np.float32],
         moments: OptimizerState,
         rule: AdamParameters,
         rigid: NDArray[np.float64] | None = None,
     ) -> int:
-        """An optimizer step from the gradients in ``sums``: changes the Gaussians and their moments. Returns how many
+        """An optimizer step from the gradients in ``sums``: changes the parameters and their moments. Returns how many
         gradients were not finite.
 
         camera: as given to the last ``project_and_bin``.
         rigid: float64 (6,), written: force and torque, see ``adam_step``.
         """
-        count = len(gaussians.params)
+        count = len(params)
         blocks = -(-count // BLOCK) + 1
         dropped, by_block = np.zeros(blocks, np.int64), np.zeros((0 if rigid is None else blocks, 6))
         mine = self.projected, self.lists, self.sums
-        self.pool.run(adam_step, camera, gaussians, count, *mine, moments, rule, dropped, by_block)
+        self.pool.run(adam_step, camera, params, count, *mine, moments, rule, dropped, by_block)
         if rigid is not None:
             rigid[:] = by_block.sum(axis=0)
         return int(dropped.sum())

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.splat import splat_constants as tuned
 from edge_server.fields.splat.kernels.optimizer_step import DEAD, OptimizerState, clamp_gaussians
-from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, SH_COLUMNS, Gaussians
+from edge_server.fields.splat.kernels.project import BASE, OPACITY, QUATERNION, SCALE, SH_COLUMNS
 from edge_server.fields.splat.settings import SplatSettings
 from freshfield.geometry import quaternion_to_matrix
 
@@ -45,10 +45,6 @@ class GaussianCloud:
 
     def __len__(self) -> int:
         return len(self.params)
-
-    def gaussians(self) -> Gaussians:
-        """The arrays that are projected, not copied."""
-        return Gaussians(self.params, (self.params.shape[1] - BASE) // SH_COLUMNS)
 
     def optimizer_state(self) -> OptimizerState:
         """The arrays that a step updates beside ``params``, not copied."""

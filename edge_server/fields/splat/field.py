@@ -89,9 +89,9 @@ class StillField(SteppedField[SplatSnapshot]):
     def error(self) -> float:
         """Mean squared error of the views that were taken in, as ``train_step`` has it."""
         with self._lock:
-            square, pixels, gaussians = 0.0, 0, self.cloud.gaussians()
+            square, pixels = 0.0, 0
             for view in self._asked:
-                self._raster.project_and_bin(self._camera(view), gaussians)
+                self._raster.project_and_bin(self._camera(view), self.cloud.params)
                 losses = self._raster.train(self._target(view))
                 square, pixels = square + float(losses[:, 0].sum()), pixels + TILE * TILE * len(losses)
         return square / (3 * max(pixels, 1))
@@ -109,7 +109,7 @@ class StillField(SteppedField[SplatSnapshot]):
     def _live(self) -> SplatSnapshot:
         return SplatSnapshot(
             box=self.view_store.box or UNIT_BOX,
-            gaussians=self.cloud.gaussians(),
+            params=self.cloud.params,
             background=self.view_store.background(),
             pool=self.pool,
             step=self.step,
@@ -189,10 +189,11 @@ class StillField(SteppedField[SplatSnapshot]):
         """
         view = self._next_view()
         camera, cloud, raster = self._camera(view), self.cloud, self._raster
-        gaussians = cloud.gaussians()
-        raster.project_and_bin(camera, gaussians)
+        raster.project_and_bin(camera, cloud.params)
         losses = raster.train(self._target(view))
-        dropped = raster.step(camera, gaussians, cloud.optimizer_state(), self.adam_parameters(progress), self._rigid)
+        dropped = raster.step(
+            camera, cloud.params, cloud.optimizer_state(), self.adam_parameters(progress), self._rigid
+        )
         self._learn_camera(view, losses)
         if self.settings.planar:
             from edge_server.fields.splat.planar import flatten  # compiled only where it is used
@@ -258,13 +259,13 @@ class StillField(SteppedField[SplatSnapshot]):
         raster, shows = self._render_raster, np.zeros(len(cloud), np.bool_)
         for k in range(len(data.size)):
             if (without := self._weight_of(k) == 0).any():
-                raster.project_and_bin(self._camera(k), cloud.gaussians(), differentiate=False)
+                raster.project_and_bin(self._camera(k), cloud.params, differentiate=False)
                 shows |= raster.reaching(len(cloud), without)
         given = {view.camera for view in self._views}
         for view in self.view_store.views:
             if view.camera not in given:
                 camera = camera_rows([self._pose_of(view)], [view.intrinsics], box)
-                raster.project_and_bin(camera, cloud.gaussians(), differentiate=False)
+                raster.project_and_bin(camera, cloud.params, differentiate=False)
                 shows |= raster.lists.own_count[: len(cloud)] > 0
         cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
 

@@ -12,19 +12,18 @@ from numpy.typing import NDArray
 from edge_server.fields.common.kernels.camera import ORIGIN, SIZE
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud
-from edge_server.fields.splat.kernels.project import DEPTH, QUATERNION, RED, SCALE, Gaussians
+from edge_server.fields.splat.kernels.project import DEPTH, QUATERNION, RED, SCALE
 from edge_server.fields.splat.kernels.rasterize import render_tiles
 from edge_server.fields.splat.splat_constants import ASPECT, STEEPEST
 from freshfield.geometry import Pinhole, quaternion_normalize, quaternion_to_matrix
 
 
-def gaussian_planes(gaussians: Gaussians, camera: NDArray[np.float32]) -> NDArray[np.float32]:
+def gaussian_planes(params: NDArray[np.float32], camera: NDArray[np.float32]) -> NDArray[np.float32]:
     """float32 (N, 4): unit normal of each Gaussian in camera axes, facing the camera, and the plane's
     distance along it (negative), scene units. camera: a row of ``camera_rows``."""
-    p = gaussians.params
     rotation = camera[:ORIGIN].reshape(3, 3).astype(np.float64)
-    normal = gaussian_normals(p) @ rotation.T
-    middle = (p[:, :3].astype(np.float64) - camera[ORIGIN : ORIGIN + 3]) @ rotation.T
+    normal = gaussian_normals(params) @ rotation.T
+    middle = (params[:, :3].astype(np.float64) - camera[ORIGIN : ORIGIN + 3]) @ rotation.T
     distance = (normal * middle).sum(axis=1, keepdims=True)
     planes = np.concatenate([normal, distance], axis=1)
     planes[distance[:, 0] > 0] *= -1.0
@@ -46,7 +45,7 @@ def unit_quaternions(params: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def blend_planes(
-    raster: RasterBuffers, gaussians: Gaussians, camera: NDArray[np.float32]
+    raster: RasterBuffers, params: NDArray[np.float32], camera: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """The Gaussians' planes, blended as their colors are: normal (H, W, 3), distance (H, W) and opacity (H, W).
 
@@ -54,7 +53,7 @@ def blend_planes(
     """
     shape = int(camera[SIZE + 1]), int(camera[SIZE])
     planes = raster.projected.copy()
-    mine, shown = gaussian_planes(gaussians, camera), planes[: len(gaussians.params)]
+    mine, shown = gaussian_planes(params, camera), planes[: len(params)]
     shown[:, RED:DEPTH], shown[:, DEPTH] = 0.5 + 0.5 * mine[:, :3], mine[:, 3]  # colors lie in [0, 1]
     color, depth, opacity = (np.zeros((*shape, *more), np.float32) for more in ((3,), (), ()))
     raster.pool.run(
@@ -65,11 +64,11 @@ def blend_planes(
 
 
 def plane_depth(
-    raster: RasterBuffers, gaussians: Gaussians, camera: NDArray[np.float32], lens: Pinhole
+    raster: RasterBuffers, params: NDArray[np.float32], camera: NDArray[np.float32], lens: Pinhole
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Depth (H, W) along the rays, scene units, and opacity (H, W). Depth is 0 where the plane is seen at too
     flat an angle. raster, camera: see ``blend_planes``."""
-    normal, distance, opacity = blend_planes(raster, gaussians, camera)
+    normal, distance, opacity = blend_planes(raster, params, camera)
     along = (normal * lens.rays()).sum(axis=-1)
     good = (along < -STEEPEST * opacity) & (opacity > 1e-3)
     depth = np.where(good, distance / np.where(good, along, 1.0), 0.0)

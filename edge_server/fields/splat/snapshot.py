@@ -13,7 +13,6 @@ from edge_server.fields.common.camera_rows import camera_rows, ray_lengths
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.kernels.rasterize import render_tiles
 from freshfield.geometry import Pinhole
 
@@ -22,11 +21,12 @@ from freshfield.geometry import Pinhole
 class SplatSnapshot:
     """Gaussians, never written after construction.
 
+    params: float32 (N, P), see ``kernels.project``.
     planar: the Gaussians are flat, so ``render_surface`` renders depth from their planes.
     """
 
     box: SceneBox
-    gaussians: Gaussians
+    params: NDArray[np.float32]
     background: NDArray[np.float32]
     pool: Pool
     step: int
@@ -38,7 +38,7 @@ class SplatSnapshot:
 
     def copied(self) -> Self:
         """See ``stepped_field.StepSnapshot``."""
-        return replace(self, gaussians=self.gaussians._replace(params=self.gaussians.params.copy()))
+        return replace(self, params=self.params.copy())
 
     def render_surface(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
         """As ``render``, with the depth at which rays meet the Gaussians' planes (see ``planar``)."""
@@ -46,7 +46,7 @@ class SplatSnapshot:
 
         image = self.render(camera_to_world, intrinsics)
         raster, cams = self._project(camera_to_world, intrinsics)
-        depth, opacity = plane_depth(raster, self.gaussians, cams[0], intrinsics)
+        depth, opacity = plane_depth(raster, self.params, cams[0], intrinsics)
         return Rendering(image.color, depth * np.float32(self.box.radius_m), opacity)
 
     def render(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> Rendering:
@@ -62,5 +62,5 @@ class SplatSnapshot:
     def _project(self, pose: NDArray[np.float64], lens: Pinhole) -> tuple[RasterBuffers, NDArray[np.float32]]:
         """Fresh buffers with the Gaussians that one camera sees, and that camera's row."""
         raster, cams = RasterBuffers(self.pool), camera_rows([pose], [lens], self.box)
-        raster.project_and_bin(cams, self.gaussians, differentiate=False)
+        raster.project_and_bin(cams, self.params, differentiate=False)
         return raster, cams

@@ -241,7 +241,7 @@ def point_cloud(field: Snapshot) -> NDArray[np.void] | None:
     if not isinstance(field, SplatSnapshot):
         return None
     static = field.static if isinstance(field, LayeredSnapshot) else None
-    params = field.gaussians.params if static is None else static
+    params = field.params if static is None else static
     weight = weights(params) * (params[:, OPACITY] > np.log(tuned.LEAST_OPACITY / (1.0 - tuned.LEAST_OPACITY)))
     chosen = np.argsort(-weight, kind="stable")[: min(tuned.MOST_POINTS, int((weight > 0).sum()))]
     kinds = [(name, "<f4") for name in "xyz"] + [(name, "u1") for name in ("red", "green", "blue", "alpha")]

@@ -75,7 +75,7 @@ class Publisher:
             self._box = snapshot.box
             self._fields += 1
             before = None
-        params = snapshot.gaussians.params if layered is None or layered.static is None else layered.static
+        params = snapshot.params if layered is None or layered.static is None else layered.static
         static = self._static(params, None if before is None else before.static, now_s, layered)
         box = snapshot.box
         if snapshot is self._snapshot and before is not None and static is before.static:

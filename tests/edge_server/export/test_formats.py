@@ -19,7 +19,6 @@ from edge_server.export.transforms import write_transforms
 from edge_server.fields import View
 from edge_server.fields.common.kernels.volume_rendering import harmonic
 from edge_server.fields.common.scene_box import SceneBox
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.page.splats.messages import HEAD, SAVED, StaticBlock, write_message
 from edge_server.page.splats.published import Publisher
 from freshfield.geometry import se3_inverse
@@ -96,8 +95,8 @@ def test_transforms_read_back_as_they_were(tmp_path):
 def test_splats_stand_as_viewers_expect_them(tmp_path, sh_degree):
     params = RNG.normal(size=(30, 14 + 9 * sh_degree)).astype(np.float32)
     box = SceneBox((1.0, -2.0, 0.5), 2.5, 0.1, False, 3.0, 0.01)
-    gaussians, extra = Gaussians(params, sh_degree), 3 * sh_degree
-    assert write_splats(tmp_path / "s.ply", gaussians, box) == 30
+    extra = 3 * sh_degree
+    assert write_splats(tmp_path / "s.ply", params, box) == 30
     data = read_floats(tmp_path / "s.ply")
     names = [*"xyz", "nx", "ny", "nz", *numbered("f_dc", 3), *numbered("f_rest", 3 * extra), "opacity"]
     assert list(data) == [*names, *numbered("scale", 3), *numbered("rot", 4)]
@@ -122,9 +121,9 @@ def test_splats_stand_as_viewers_expect_them(tmp_path, sh_degree):
 def test_splats_come_back_from_spz(tmp_path, sh_degree, radius_m, off_m):
     gsply = pytest.importorskip("gsply", reason="gsply is not installed (extra spz)")
     params = RNG.uniform(-1.0, 1.0, (30, 14 + 9 * sh_degree)).astype(np.float32)
-    gaussians, box = Gaussians(params, sh_degree), SceneBox((1.0, -2.0, 0.5), radius_m, 0.1, False, 3.0, 0.01)
-    assert write_splats(tmp_path / "s.SPZ", gaussians, box) == 30
-    found, data = gsply.read_spz(tmp_path / "s.SPZ"), splat_table(gaussians, box)
+    box = SceneBox((1.0, -2.0, 0.5), radius_m, 0.1, False, 3.0, 0.01)
+    assert write_splats(tmp_path / "s.SPZ", params, box) == 30
+    found, data = gsply.read_spz(tmp_path / "s.SPZ"), splat_table(params, box)
     assert np.abs(found.means - columns(data, "xyz")).max() <= off_m
     scales = np.clip(columns(data, numbered("scale", 3)), -10, 255 / 16 - 10)
     assert np.abs(found.scales - scales).max() <= 1 / 32 + 1e-6

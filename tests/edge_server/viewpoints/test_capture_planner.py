@@ -22,7 +22,7 @@ from edge_server.viewpoints.preference_model import Answer, fit_reward
 from edge_server.viewpoints.registry import SELECTORS, CaptureState, make_selector
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
-from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, random_params
+from tests.edge_server.fields.splat.kernels.small_cloud import BOX, random_params
 from tests.support import refused
 
 LENS = Pinhole.from_fov(16, 16, 50.0)
@@ -154,7 +154,7 @@ POSES = [look_at(eye, (0.05, 0.0, 0.1)) for eye in ((1.0, -2.5, 0.8), (-0.4, -1.
 
 
 def snapshot(params, threads=1):
-    return SplatSnapshot(BOX, as_gaussians(params), BACK, Pool(threads, 0), 1)
+    return SplatSnapshot(BOX, params, BACK, Pool(threads, 0), 1)
 
 
 def oracle(params, pose, lens):

@@ -58,9 +58,8 @@ class ScanSnapshot(SplatSnapshot):
     cameras: RefinedCameras | None = None
 
     def copied(self) -> Self:
-        gaussians = self.gaussians._replace(params=self.gaussians.params.copy())
         cameras = None if self.cameras is None else self.cameras.copied()
-        return replace(self, gaussians=gaussians, cameras=cameras)
+        return replace(self, params=self.params.copy(), cameras=cameras)
 
     def correction(self, view: View) -> Correction | None:
         """See ``fields.RefinesCameras``."""

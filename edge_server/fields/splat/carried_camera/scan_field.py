@@ -288,7 +288,7 @@ class ScanField(StillField):
         color, depth, alpha = (np.zeros((h, w, *more), np.float32) for more in ((3,), (), ()))
         if len(self.cloud):
             raster, pose = self._render_raster, self._pose_of(view) if pose is None else pose
-            raster.project_and_bin(camera_rows([pose], [lens], box), self.cloud.gaussians(), False)
+            raster.project_and_bin(camera_rows([pose], [lens], box), self.cloud.params, False)
             self.pool.run(render_tiles, raster.raster, self.view_store.background(), color, depth, alpha)
         return Shown(color, depth * np.float32(box.radius_m), alpha)
 

@@ -176,7 +176,7 @@ def _adam(first, size, params, moments, rule, g):
 
 
 @kernel
-def adam_step(counter, worker, camera, gaussians, count, projected, lists, pair_sums, moments, rule, dropped, rigid):
+def adam_step(counter, worker, camera, params, count, projected, lists, pair_sums, moments, rule, dropped, rigid):
     """An Adam step of all Gaussians that have pairs; the others and their moments stay as they are. Tasks
     are blocks of Gaussians.
 
@@ -187,7 +187,6 @@ def adam_step(counter, worker, camera, gaussians, count, projected, lists, pair_
     rigid: float64 (blocks, 6), 0 at first; sums over blocks are the force and torque on all Gaussians as one rigid
         body, about the camera's center (``add_force``, ``add_torque``). (0, 6): not asked for.
     """
-    params = gaussians.params
     width = params.shape[1]
     s, g = block_scratch(width), np.empty(3 * width * BLOCK, np.float32)
     blocks = (count + BLOCK - 1) // BLOCK
@@ -200,12 +199,12 @@ def adam_step(counter, worker, camera, gaussians, count, projected, lists, pair_
         dropped[block] = 0
         if gather_sums(base, here, projected, lists, pair_sums, s) == 0:
             continue
-        load_block(gaussians, base, here, s)
+        load_block(params, base, here, s)
         cam = load_camera(camera, 0)
         project_backward(cam, s)
         if rigid.shape[0] > 0:
             add_torque(cam, s, here, rigid[block, 3:])
-        harmonics_backward(cam, gaussians, base, here, s)
+        harmonics_backward(cam, params, base, here, s)
         if rigid.shape[0] > 0:
             add_force(s, here, rigid[block])
         for j in range(here):

@@ -7,10 +7,7 @@ undistortion at intake, and any camera can be rendered.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
 from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, SIZE, lens_terms, load_camera, rotate_to_camera
 from edge_server.fields.common.kernels.jit import device_function, kernel
@@ -24,8 +21,8 @@ from edge_server.fields.splat.splat_constants import (
     RAW_OPACITY_LIMIT,
 )
 
-# Columns of a Gaussian's parameters; from BASE on the SH_COLUMNS of the spherical harmonics of degree 1,
-# three for each.
+# Columns of a Gaussian's parameters; from BASE on the SH_COLUMNS of the spherical harmonics of degree 1, three for
+# each, or none.
 POSITION, SCALE, QUATERNION, OPACITY, COLOR = 0, 3, 6, 10, 11
 BASE, SH_COLUMNS = 14, 9
 # Columns of a projected Gaussian.
@@ -53,17 +50,6 @@ _PX, _PY, _PZ, _A, _B, _C, _WIDE, _HIGH, _LEFT, _RIGHT, _TOP, _BOTTOM = (n * BLO
 _ROWS = 26
 
 _F0, _F1, _F2, _HALF = np.float32(0.0), np.float32(1.0), np.float32(2.0), np.float32(0.5)
-
-
-class Gaussians(NamedTuple):
-    """The Gaussians as the kernels read them.
-
-    params: float32 (N, BASE + SH_COLUMNS sh_degree).
-    sh_degree: degree of the color's spherical harmonics, 0 or 1.
-    """
-
-    params: NDArray[np.float32]
-    sh_degree: int
 
 
 @device_function
@@ -114,10 +100,9 @@ def rotate_to_world(cam, j0, j1, j2):
 
 
 @device_function
-def _load_block(gaussians, base, count, s):
+def _load_block(params, base, count, s):
     """Load Gaussians base, ..., base + count - 1 into the rows of ``s``: position, axes of the ellipsoid times their
     lengths, opacity, and the Gaussian's extent in standard deviations squared (0: invisible)."""
-    params = gaussians.params
     for j in range(count):
         i = base + j
         for k in range(3):
@@ -208,16 +193,15 @@ def _touched_tiles(px, py, a, b, c, reach, x0, x1, y0, y1):
 
 
 @device_function
-def _write_projected(cam, gaussians, i, s, j, row, edges):
+def _write_projected(cam, params, i, s, j, row, edges):
     """Fill row (PROJECTED,) and edges (FOOTPRINT,) of Gaussian i from column j of ``s``. The conic is the
     upper triangle of the inverse of the projected covariance."""
-    params = gaussians.params
     row[MEAN_X], row[MEAN_Y], row[DEPTH] = s[_PX + j], s[_PY + j], s[_PZ + j]
     row[CONIC_A], row[CONIC_B], row[CONIC_C] = s[_A + j], s[_B + j], s[_C + j]
     row[ALPHA], row[RADIUS], row[HALF_HEIGHT] = s[_ALPHA + j], s[_WIDE + j], s[_HIGH + j]
     for k in range(3):
         row[RED + k] = params[i, COLOR + k]
-    if gaussians.sh_degree > 0:
+    if params.shape[1] > BASE:
         ox, oy, oz = params[i, 0] - cam[ORIGIN], params[i, 1] - cam[ORIGIN + 1], (params[i, 2] - cam[ORIGIN + 2])
         length = _F1 / max(np.sqrt(ox * ox + oy * oy + oz * oz), np.float32(1e-9))
         ox, oy, oz = ox * length, oy * length, oz * length
@@ -247,11 +231,11 @@ def _write_projected(cam, gaussians, i, s, j, row, edges):
 
 
 @kernel
-def project(counter, worker, camera, gaussians, count, projected, tiles):
+def project(counter, worker, camera, params, count, projected, tiles):
     """Project all Gaussians into a camera. Tasks are blocks of Gaussians.
 
     camera: float32 (1, CAMERA).
-    gaussians: ``Gaussians``, of which the first ``count`` are projected.
+    params: float32 (>= count, BASE or BASE + SH_COLUMNS), of which the first ``count`` are projected.
     projected: float32 (>= count, PROJECTED), written where a Gaussian is in the image.
     tiles: int32 (>= count, FOOTPRINT), written.
     """
@@ -261,11 +245,11 @@ def project(counter, worker, camera, gaussians, count, projected, tiles):
         if base >= count:
             return
         here = min(BLOCK, count - base)
-        _load_block(gaussians, base, here, s)
+        _load_block(params, base, here, s)
         _project_block(cam, s)
         for j in range(here):
             i = base + j
             edges = tiles[i]
             edges[0] = edges[1] = edges[2] = edges[3] = 0
             if s[_LEFT + j] <= s[_RIGHT + j]:
-                _write_projected(cam, gaussians, i, s, j, projected[i], edges)
+                _write_projected(cam, params, i, s, j, projected[i], edges)

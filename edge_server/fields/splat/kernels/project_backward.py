@@ -46,9 +46,8 @@ def block_scratch(width):
 
 
 @device_function
-def load_block(gaussians, base, count, s):
+def load_block(params, base, count, s):
     """Load Gaussians base, ..., base + count - 1 into the rows of ``s`` and set their gradients to 0."""
-    params = gaussians.params
     for j in range(count):
         i = base + j
         for k in range(3):
@@ -188,10 +187,9 @@ def project_backward(cam, s):
 
 
 @device_function
-def harmonics_backward(cam, gaussians, base, count, s):
+def harmonics_backward(cam, params, base, count, s):
     """Add the gradient by way of the view-dependent color, which ``project_backward`` leaves out."""
-    params = gaussians.params
-    if gaussians.sh_degree == 0:
+    if params.shape[1] == BASE:
         return
     for j in range(count):
         if s[SEEN + j] == _F0:

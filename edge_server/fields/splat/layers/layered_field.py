@@ -28,7 +28,7 @@ from edge_server.fields.common.supervision import check_view
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool, compile_kernels, shared_pool
 from edge_server.fields.common.training_schedule import StepBudget, StepTimer
 from edge_server.fields.splat.field import StillField
-from edge_server.fields.splat.kernels.project import COLOR, Gaussians
+from edge_server.fields.splat.kernels.project import COLOR
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.layered_state import pack, unpack
 from edge_server.fields.splat.layers.motion_tracker import MotionTracker
@@ -101,7 +101,7 @@ class LayeredField:
         self.origin_ns: int | None = None
         self.supervision = StaticSupervision(self.static, self.depth_network)
         self._published: SplatSnapshot | None = None
-        self._exposed: tuple[SplatSnapshot, bytes, Gaussians] | None = None  # see ``_at_present_exposure``
+        self._exposed: tuple[SplatSnapshot, bytes, NDArray[np.float32]] | None = None  # see ``_at_present_exposure``
 
     @property
     def frame_s(self) -> float | None:
@@ -452,16 +452,16 @@ class LayeredField:
         depth = self.supervision.depth
         parts = still.box, exposed, still.background, still.pool, still.step, still.planar
         surfaces = None if depth is None else depth.scene
-        self._published = LayeredSnapshot(*parts, static=exposed.params, moving=shown, surfaces=surfaces)
+        self._published = LayeredSnapshot(*parts, static=exposed, moving=shown, surfaces=surfaces)
 
-    def _at_present_exposure(self, shown: SplatSnapshot) -> Gaussians:
-        """The still field at the cameras' present exposure; the arrays of the last publication, where nothing has
-        changed."""
+    def _at_present_exposure(self, shown: SplatSnapshot) -> NDArray[np.float32]:
+        """Parameters of the still field at the cameras' present exposure; those of the last publication, where
+        nothing has changed."""
         gain = np.median([c.plate.gain for c in self.cameras.values()], axis=0).astype(np.float32)
         if self._exposed is None or self._exposed[0] is not shown or self._exposed[1] != gain.tobytes():
-            params = shown.gaussians.params.copy()
+            params = shown.params.copy()
             params[:, COLOR:] *= np.tile(gain, (params.shape[1] - COLOR) // 3)
-            self._exposed = (shown, gain.tobytes(), Gaussians(params, self.settings.sh_degree))
+            self._exposed = (shown, gain.tobytes(), params)
         return self._exposed[2]
 
 

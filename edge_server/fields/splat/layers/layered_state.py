@@ -15,7 +15,6 @@ from edge_server.fields import View
 from edge_server.fields.common.field_state import unpack_meta
 from edge_server.fields.common.supervision import check_view
 from edge_server.fields.splat.field import StillField
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.layer_constants import FRAMES_KNOWN
 from edge_server.fields.splat.layers.motion import ViewRow
 from edge_server.fields.splat.layers.observations import FixedCamera, Observation, Observations
@@ -67,7 +66,7 @@ def pack(field: Any) -> Arrays:
     if field.supervision.depth is not None:
         state |= _prefixed("depth.", field.supervision.depth.state())
     if (earlier := field.supervision.earlier) is not None:
-        state |= {"earlier": earlier.gaussians.params.copy(), "earlier_step": np.array(earlier.step)}
+        state |= {"earlier": earlier.params.copy(), "earlier_step": np.array(earlier.step)}
     tracked = None
     if field.tracker is not None:
         state |= _prefixed("moving.", field.tracker.moving.state())
@@ -120,10 +119,9 @@ def unpack(field: Any, state: Arrays) -> None:
     _set(field.supervision, SUPERVISED, meta)
     if "earlier" in state:
         params, now = np.array(state["earlier"]), field.still.snapshot()
-        if params.ndim != 2 or params.shape[1:] != now.gaussians.params.shape[1:] or params.dtype != np.float32:
+        if params.ndim != 2 or params.shape[1:] != now.params.shape[1:] or params.dtype != np.float32:
             raise ValueError("what was shown before layers are is damaged")
-        gaussians = Gaussians(params, field.settings.sh_degree)
-        field.supervision.earlier = replace(now, gaussians=gaussians, step=int(state["earlier_step"]))
+        field.supervision.earlier = replace(now, params=params, step=int(state["earlier_step"]))
     field.refused = set(meta["refused"])
     if meta["tracked"] is not None:
         if field.still.view_store.box is None:

@@ -16,7 +16,6 @@ from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.densification import GaussianCloud, densify_and_prune, opacity
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.kernels.rasterize import Target
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.kernels.align import align_view
@@ -78,11 +77,11 @@ class MovingSet:
         """Where the Gaussians are at an instant, float32 (N, 3), scene units."""
         return self.motion.displaced(self.cloud.params[:, :3], self.anchor, self.share, instant_s)
 
-    def gaussians(self, instant_s: float) -> Gaussians:
-        """The Gaussians of an instant, copied."""
+    def params(self, instant_s: float) -> NDArray[np.float32]:
+        """The Gaussians' parameters at an instant, float32 (N, P), copied."""
         params = self.cloud.params.copy()
         params[:, :3] = self.places(instant_s)
-        return Gaussians(params, self.settings.sh_degree)
+        return params
 
     def distance_m(self, camera: FixedCamera, instant_s: float) -> float:
         """Distance from a camera to the middle of the Gaussians, meters."""
@@ -99,12 +98,12 @@ class MovingSet:
         the opacity of the moving set, float32 (H, W)."""
         assert camera.row is not None and observation.weight is not None and self.motion.anchors is not None
         instant_s = observation.instant_s
-        gaussians = self.gaussians(instant_s)
-        self.raster.project_and_bin(camera.row, gaussians, differentiate=False)
+        params = self.params(instant_s)
+        self.raster.project_and_bin(camera.row, params, differentiate=False)
         m, v, shown, opacity = align_view(
             self.raster,
             camera.row,
-            gaussians.params[:, :3],
+            params[:, :3],
             observation.view.image,
             camera.plate.picture,
             observation.weight,
@@ -136,13 +135,13 @@ class MovingSet:
         """One optimizer step on one frame, over the camera's plate. Returns pairs of Gaussian and tile."""
         assert camera.row is not None and observation.weight is not None
         raster, cloud = self.raster, self.cloud
-        gaussians = self.gaussians(observation.instant_s)
-        before = gaussians.params[:, :3].copy()
-        raster.project_and_bin(camera.row, gaussians)
+        params = self.params(observation.instant_s)
+        before = params[:, :3].copy()
+        raster.project_and_bin(camera.row, params)
         raster.train(_over_plate(observation, camera))
-        raster.step(camera.row, gaussians, cloud.optimizer_state(), parameters)
-        rest = cloud.params[:, :3] + (gaussians.params[:, :3] - before)
-        cloud.params[:] = gaussians.params
+        raster.step(camera.row, params, cloud.optimizer_state(), parameters)
+        rest = cloud.params[:, :3] + (params[:, :3] - before)
+        cloud.params[:] = params
         cloud.params[:, :3] = rest
         self.steps += 1
         if self.steps - self._grown >= tuned.DENSIFY_EVERY:

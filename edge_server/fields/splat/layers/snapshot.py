@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.motion import Motion
 from edge_server.fields.splat.layers.moving_set import MovingSet
@@ -77,4 +76,4 @@ class LayeredSnapshot(SplatSnapshot):
             return self
         ahead_s = self.moving.ahead_s(present_ns)
         params = np.concatenate([self.static, self.moving.params_at(ahead_s)])
-        return replace(self, gaussians=Gaussians(params, self.gaussians.sh_degree))
+        return replace(self, params=params)

@@ -22,7 +22,6 @@ from edge_server.fields.common.threads.thread_pool import lower_priority
 from edge_server.fields.common.training_schedule import StepBudget
 from edge_server.fields.field_constants import LOSS_STEPS
 from edge_server.fields.splat.field import StillField
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.snapshot import SplatSnapshot
 
@@ -235,7 +234,7 @@ class StaticLayer:
         if self.shown is None or self.shown.step != self.field.step:
             snapshot = self.field.snapshot()
             if self._mean is not None:
-                snapshot = replace(snapshot, gaussians=Gaussians(self._mean.copy(), self.field.settings.sh_degree))
+                snapshot = replace(snapshot, params=self._mean.copy())
             self.shown = snapshot
         fits = self._error <= self._better_than or self.shown.step >= tuned.SHOWN_AT_LATEST
         self.ready = self.ready or (fits and self.shown.step >= self.shown_after)

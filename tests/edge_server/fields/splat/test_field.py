@@ -12,7 +12,7 @@ from edge_server.surface.depth import render_depth_maps
 from freshfield.geometry import Pinhole, look_at, matrix_to_quaternion, so3_exp, world_rays
 from tests.edge_server.fields.scenes import ring
 from tests.edge_server.fields.small import tiny
-from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, binned, random_params
+from tests.edge_server.fields.splat.kernels.small_cloud import BOX, binned, random_params
 
 RNG = np.random.default_rng(0)
 
@@ -86,7 +86,7 @@ def flat(count: int, tilt: np.ndarray) -> np.ndarray:
 def test_the_depth_of_a_plane_is_where_the_rays_meet_it(angle: float) -> None:
     tilt, cams = so3_exp([0.0, angle, 0.0]), camera_rows([POSE], [LENS], BOX)
     params = flat(400, tilt)
-    depth, opacity = plane_depth(binned(cams, params), as_gaussians(params), cams[0], LENS)
+    depth, opacity = plane_depth(binned(cams, params), params, cams[0], LENS)
     origin, rays = world_rays(LENS, POSE)
     exact = -(origin @ tilt[:, 2]) / (rays @ tilt[:, 2])
     solid = opacity > 0.9

@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import CallerPool
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.layers.layer_constants import KNOTS_PER_S
 from edge_server.fields.splat.layers.motion import WINDOW, Motion
 from edge_server.fields.splat.layers.snapshot import LayeredSnapshot, MovingSnapshot
@@ -54,5 +53,5 @@ def snapshot(
     if movers:
         params = gaussians(movers, 1, 0.2)
         moving = MovingSnapshot(params, *motion().attach(params[:, :3], newest_s), motion(), ORIGIN_NS, newest_s)
-    shown = LayeredSnapshot(box, Gaussians(static, 0), BACKGROUND, CallerPool(), 0, static=static, moving=moving)
+    shown = LayeredSnapshot(box, static, BACKGROUND, CallerPool(), 0, static=static, moving=moving)
     return shown.at(None)

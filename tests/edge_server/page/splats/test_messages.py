@@ -6,7 +6,6 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
-from edge_server.fields.splat.kernels.project import Gaussians
 from edge_server.fields.splat.snapshot import SplatSnapshot
 from edge_server.page.splats import messages
 from edge_server.page.splats import records as packing
@@ -193,7 +192,7 @@ def test_the_visitor_sees_what_the_edge_renders():
     assert published is not None
     for ahead_s in (-0.2, 0.0, 0.13, 0.5):
         wanted = shown.at(ORIGIN_NS + round((NEWEST_S + ahead_s) * 1e9))
-        got = replace(shown, gaussians=Gaussians(read(published, BEGIN_S + NEWEST_S + ahead_s), 0))
+        got = replace(shown, params=read(published, BEGIN_S + NEWEST_S + ahead_s))
         one, two = (each.render(POSE, LENS).color for each in (wanted, got))
         assert psnr(one, two) > 50.0 and one.std() > 0.1
 
@@ -225,7 +224,7 @@ def test_a_set_is_the_same_one_while_the_field_trains_on():
 
 
 def test_a_still_field_and_one_without_gaussians():
-    still = SplatSnapshot(BOX, Gaussians(gaussians(50, 0), 0), np.zeros(3, np.float32), snapshot().pool, 0)
+    still = SplatSnapshot(BOX, gaussians(50, 0), np.zeros(3, np.float32), snapshot().pool, 0)
     published = Publisher(5).take(still, 0.0)
     assert (published.moving, published.knots) == (None, None)
     assert len(published.static.records) == 50

@@ -9,7 +9,7 @@ from edge_server.fields.common.scene_box import SceneBox
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat.buffers import RasterBuffers
 from edge_server.fields.splat.kernels.optimizer_step import AdamParameters, OptimizerState
-from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE, Gaussians
+from edge_server.fields.splat.kernels.project import BASE, COLOR, OPACITY, QUATERNION, SCALE
 from edge_server.fields.splat.kernels.rasterize import Target
 
 BOX = SceneBox((0.0, 0.0, 0.0), 1.0, 0.05, False, 3.0, 0.05)
@@ -27,17 +27,12 @@ def random_params(count: int = 12, sh_degree: int = 0, seed: int = 0) -> np.ndar
     return params
 
 
-def as_gaussians(params: np.ndarray) -> Gaussians:
-    """What the kernels read."""
-    return Gaussians(params, (params.shape[1] - BASE) // 9)
-
-
 def binned(
     camera: np.ndarray, params: np.ndarray, differentiate: bool = True, pool: Pool | None = None
 ) -> RasterBuffers:
     """Buffers after ``project_and_bin``."""
     raster = RasterBuffers(pool or CallerPool())
-    raster.project_and_bin(camera, as_gaussians(params), differentiate)
+    raster.project_and_bin(camera, params, differentiate)
     return raster
 
 
@@ -57,5 +52,5 @@ def stepped(
     moments = OptimizerState(np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32), *flat)
     rule = AdamParameters(np.zeros(params.shape[1], np.float32), np.ones((4, 3), np.float32), np.float32(1e-8))
     assert losses[:, 1].sum() == 0
-    assert raster.step(camera, as_gaussians(params.copy()), moments, rule, rigid) == 0
+    assert raster.step(camera, params.copy(), moments, rule, rigid) == 0
     return losses, 10.0 * moments.m, rigid  # Adam's first moment, after one step from 0

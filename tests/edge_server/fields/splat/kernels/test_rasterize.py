@@ -20,7 +20,7 @@ from edge_server.fields.splat.kernels.rasterize import LOSSES, MOMENTS, render_t
 from freshfield.geometry import Pinhole, look_at
 from tests.edge_server.fields.splat import torch_oracle
 from tests.edge_server.fields.splat.kernels import small_cloud
-from tests.edge_server.fields.splat.kernels.small_cloud import BACK, BOX, as_gaussians, binned, random_params
+from tests.edge_server.fields.splat.kernels.small_cloud import BACK, BOX, binned, random_params
 
 LENS = Pinhole(21, 18, 22.0, 24.0, 10.0, 9.5)
 BENT = replace(LENS, distortion=(-0.12, 0.03, 0.01, -0.015))
@@ -292,14 +292,14 @@ def test_a_step_is_adams(sh_degree: int) -> None:
     raster, camera = _raster(params)
     width = params.shape[1]
     moments = _moments(width, filled=False)
-    raster.step(camera, as_gaussians(params.copy()), moments, _adam_parameters(width, 0.0))
+    raster.step(camera, params.copy(), moments, _adam_parameters(width, 0.0))
     g = (moments.m / np.float32(1.0 - BETA1)).astype(np.float64)  # from Adam's first moment after one step from 0
     seen = raster.lists.own_count[:COUNT] > 0
     assert 0 < (~seen).sum() < COUNT // 2 and (np.abs(g[seen]).max(axis=1) > 0).all()
     moments, after = _moments(width, filled=True), params.copy()
     before = OptimizerState(*(np.array(array, np.float64) for array in moments))
     rule = _adam_parameters(width, 1e-3)
-    assert raster.step(camera, as_gaussians(after), moments, rule) == 0
+    assert raster.step(camera, after, moments, rule) == 0
 
     m = BETA1 * before.m + (1.0 - BETA1) * g
     v = BETA2 * before.v + (1.0 - BETA2) * g * g
@@ -322,11 +322,11 @@ def test_what_is_not_finite_is_dropped_and_counted(broken: float) -> None:
     raster, camera = _raster(params)
     victim = int(np.flatnonzero(raster.lists.own_count[:COUNT] > 0)[40])
     rule, sound, hurt = _adam_parameters(BASE, 1e-3), params.copy(), params.copy()
-    raster.step(camera, as_gaussians(sound), _moments(BASE, filled=True), rule)
+    raster.step(camera, sound, _moments(BASE, filled=True), rule)
     raster.sums[raster.lists.own_first[victim], 7] = broken
     moments = _moments(BASE, filled=True)
     was = moments.m[victim, COLOR + 1]
-    assert raster.step(camera, as_gaussians(hurt), moments, rule) == 1
+    assert raster.step(camera, hurt, moments, rule) == 1
     sound[victim, COLOR + 1] = params[victim, COLOR + 1]
     np.testing.assert_array_equal(hurt, sound)
     assert moments.m[victim, COLOR + 1] == was and np.isfinite(moments.v).all()

@@ -81,7 +81,7 @@ def test_what_moves_is_shown_at_any_instant() -> None:
     earlier = now.at(round((instant_s - 0.3) * 1e9))
     assert ball.score_of(earlier, instant_s - 0.3) > ball.score_of(now, instant_s - 0.3) + 1.0
     again = earlier.at(round(instant_s * 1e9))
-    np.testing.assert_array_equal(again.gaussians.params, now.gaussians.params)
+    np.testing.assert_array_equal(again.params, now.params)
 
 
 def test_a_state_continues_bit_for_bit_whatever_the_order_of_views_and_the_threads() -> None:

@@ -10,7 +10,7 @@ from edge_server.fields.splat.kernels.composite import ALPHA_MAX, STOP
 from edge_server.fields.splat.kernels.project import ALPHA, ALPHA_MIN, CONIC_A, CONIC_B, CONIC_C, MEAN_X, MEAN_Y, RED
 from edge_server.fields.splat.layers.kernels.align import NOISE, ROBUST, align_view
 from freshfield.geometry import Pinhole, look_at
-from tests.edge_server.fields.splat.kernels.small_cloud import BOX, as_gaussians, binned, random_params
+from tests.edge_server.fields.splat.kernels.small_cloud import BOX, binned, random_params
 
 LENS = Pinhole(29, 21, 30.0, 31.0, 14.0, 10.0)
 POSE = look_at((1.0, -2.5, 0.8), (0.05, 0.0, 0.1))
@@ -109,6 +109,6 @@ def test_hard_gaussians_stay_finite():
     params[2, 3:6] = 30.0
     params[3, 10] = 80.0
     raster = RasterBuffers(Pool(1))
-    raster.project_and_bin(CAMS, as_gaussians(params), differentiate=False)
+    raster.project_and_bin(CAMS, params, differentiate=False)
     for found in align_view(raster, CAMS, params[:, :3], image, plate, weight, anchor, share, ANCHORS):
         assert np.isfinite(found).all()
