@@ -37,6 +37,7 @@ class CallFlow:
         self._messages: deque[Message] = deque()
         self._read = 0
         self._dropped = 0
+        self._due_ns = 0  # of the message that was decided last, of those passed on or left out
         self._ended = False
         self._wake = asyncio.Event()
         self._not_full = asyncio.Event()
@@ -129,11 +130,13 @@ class CallFlow:
             self._link.offer(message, self._now_ns())
 
     async def _pass(self, message: Message, write: Write) -> None:
+        if message.transit is not None:
+            self._due_ns = max(self._due_ns, message.transit.ended_ns or 0)
         if not message.delivered:
             self._dropped += 1
         else:
             if self._link is not None:
-                self._link.hand_on(message, self._now_ns())
+                self._link.hand_on(message, self._now_ns(), self._due_ns)
             await write(message.raw)
             # A unary method takes one message, so the only message of a call is not written twice.
             if message.duplicated and self._read > 1:

@@ -68,7 +68,7 @@ class DelayStats:
 
     drawn: delay drawn by the link.
     latency: from receiving a message to handing it on.
-    error: from the instant at which a message was due to handing it on.
+    error: from the instant at which a message, and all that it has to wait for, was due to handing it on.
     total: further statistics that count every message of these too.
     """
 
@@ -153,14 +153,17 @@ class LiveLink:
         """Act on all decisions due up to the channel's instant ``now_ns``."""
         self._act(self.model.advance(now_ns))
 
-    def hand_on(self, message: Message, at_ns: int) -> None:
-        """Record that the message is being handed to gRPC at ``at_ns``, which counts as its delivery."""
+    def hand_on(self, message: Message, at_ns: int, due_ns: int = 0) -> None:
+        """Record that the message is being handed to gRPC at ``at_ns``, which counts as its delivery.
+
+        due_ns: when the last of the messages that it has to wait for was due.
+        """
         transit = message.transit
         assert transit is not None and transit.ended_ns is not None
         self.last_ns = at_ns
         self.forwarded += 1
         self.stats.latency.add((at_ns - transit.offered_ns) / 1e6)
-        self.stats.error.add((at_ns - transit.ended_ns) / 1e6)
+        self.stats.error.add((at_ns - max(transit.ended_ns, due_ns)) / 1e6)
         self.age.add(at_ns, transit.offered_ns)
         self.record(message, at_ns)
 

@@ -25,7 +25,7 @@ class Figures:
         None if none has.
     delay_ms: delay drawn by the link.
     latency_ms: from receiving a message to handing it on.
-    error_ms: from the instant at which a message was due to handing it on.
+    error_ms: from the instant at which a message, and those before it in its stream, was due to handing it on.
     """
 
     offered: int

@@ -154,13 +154,14 @@ class TcpProxy(Proxy):
 
     async def _carry_both(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._connections += 1
+        name = f"connection{self._connections}"
         try:
             async with asyncio.timeout(tuned.CONNECT_TIMEOUT_S):
                 there, back = await asyncio.open_connection(*socket_address(self.options.to))
         except OSError as error:  # TimeoutError is one
             log.warning("%s does not answer: %s", self.options.to, str(error) or "timeout")
             return
-        name, both = f"connection{self._connections}", Connection(back, writer)
+        both = Connection(back, writer)
         up = Pipe(name, both, self._link_of("up", "bytes"), self.events.now_ns)
         down = Pipe(name, both, self._link_of("down", "bytes"), self.events.now_ns)
         parts = [asyncio.create_task(up.pass_on(reader, back)), asyncio.create_task(down.pass_on(there, writer))]
