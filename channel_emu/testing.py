@@ -40,6 +40,7 @@ from channel_emu.live.proxy import Proxy, ProxyOptions
 from channel_emu.live.report import Report, show
 from channel_emu.model.settings import ChannelConfig, channel_from_mapping
 from channel_emu.pytest_plugin import channel
+from freshfield.transport import peer
 
 __all__ = ["EmulatedLink", "channel"]
 
@@ -64,7 +65,7 @@ class EmulatedLink:
         section: Any = {"preset": channel} if isinstance(channel, str) else channel
         self.config = section if isinstance(section, ChannelConfig) else channel_from_mapping(section)
         self.seed = seed
-        self.options = ProxyOptions("127.0.0.1:0", to, direction=direction)
+        self.options = ProxyOptions("127.0.0.1:0", peer("to", to), direction=direction)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="channel", daemon=True)
         self._thread.start()
@@ -86,8 +87,10 @@ class EmulatedLink:
         try:
             self._await(asyncio.wait_for(self._proxy.settled(), timeout_s), timeout_s + tuned.PATIENCE_S)
         except TimeoutError:
-            inside = self.report().in_flight
-            raise TimeoutError(f"{inside} messages are still inside the link after {timeout_s:g} s") from None
+            inside = self.report().in_flight + self._proxy.pending
+            raise TimeoutError(
+                f"{inside} messages are still inside the link, or wait for their reader, after {timeout_s:g} s"
+            ) from None
         return self.report()
 
     def close(self) -> None:

@@ -187,6 +187,12 @@ def test_behind_a_message_in_the_link_no_more_are_read_than_the_bound(channel, g
     wait_until(lambda: link.report().offered == 11, "it does not go on")
 
 
+def test_messages_that_nobody_reads_are_counted_and_a_wrong_address_is_refused(channel, monkeypatch):
+    refused(ValueError, "to: expected HOST:PORT", channel, "ideal", to="greeter")
+    monkeypatch.setattr(proxy.Proxy, "pending", 3)
+    refused(TimeoutError, "^3 messages .* wait for their reader, after", channel("ideal", to="127.0.0.1:1").settle, 0.1)
+
+
 def test_no_service_and_a_link_that_failed_say_so_and_it_still_closes(channel):
     link = channel("ideal", to="127.0.0.1:1")
     assert code_of(client(link).unary_unary(HELLO), b"") == "UNAVAILABLE"
