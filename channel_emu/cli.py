@@ -88,7 +88,7 @@ def _run(args: argparse.Namespace) -> int:
     from channel_emu.live.frame_proxy import FrameProxy
 
     plan = scenario.load(args.scenario, args.seed)
-    config = channel_from_mapping(plan.channel, f"{plan.path}: channel", plan.path.parent)
+    config = channel_from_mapping(plan.channel, f"{plan.path}: channel", plan.path.parent, plan.cameras)
     return _serve(args, partial(FrameProxy, cameras=plan.cameras, out=args.out), config, plan.seed)[0]
 
 

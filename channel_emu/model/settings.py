@@ -7,6 +7,7 @@ the chain's state is one number, or a list with one entry a state.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -174,7 +175,9 @@ class ChannelConfig(Settings, frozen=True):
         return {key: value for key, value in as_mapping(self).items() if key != "preset"}
 
 
-def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Path()) -> ChannelConfig:
+def channel_from_mapping(
+    mapping: Any, where: str = "channel", folder: Path = Path(), cameras: Sequence[str] = ()
+) -> ChannelConfig:
     """Read a ``channel:`` section; an empty one is the ideal channel.
 
     Keys beside ``preset`` override the preset's. Mappings are merged key by key, but one that names another
@@ -182,6 +185,7 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
     on the command line (``notation``), and a fault as the value of its first parameter.
 
     where: what error messages call the section. folder: what file names in the section are relative to.
+    cameras: those of the scenario, which a blackout may name; not given: any.
     Raises ScenarioError (a ValueError), one line that names the key.
     """
     if mapping is None:
@@ -199,6 +203,10 @@ def channel_from_mapping(mapping: Any, where: str = "channel", folder: Path = Pa
         merged[key] = _merge(base, value) if isinstance(base, dict) and isinstance(value, dict) else value
     merged = {key: from_notation(key, value) for key, value in merged.items()} | {"preset": name}
     faults = _read_faults(merged.pop("faults", None) or {}, f"{where}.faults")
+    if strange := [name for name in getattr(faults.get("blackout"), "cameras", ()) if cameras and name not in cameras]:
+        raise ScenarioError(
+            f"{where}.faults.blackout.cameras: {strange[0]!r} is none of the scenario's: {', '.join(cameras)}"
+        )
     config = read_settings(ChannelConfig, merged, where)
     try:
         return replace(config, faults=faults)

@@ -90,7 +90,9 @@ def checked(scenario: Scenario) -> list[str]:
     if isinstance(source, WorldConfig):
         with errors_of(f"{scenario.path}: source"):
             make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
-    channel = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
+    channel = channel_from_mapping(
+        scenario.channel, f"{scenario.path}: channel", scenario.path.parent, scenario.cameras
+    )
     try:
         from edge_server.fields.registry import settings_of
         from edge_server.scheduler import make_policy

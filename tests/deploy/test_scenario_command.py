@@ -86,6 +86,7 @@ def test_check_reads_every_section(tmp_path, capsys):
         ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
         ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),
+        ("channel: {faults: {blackout: {windows_ms: [[0, 1]], cameras: [me]}}}", "'me' is none of the scenario's: "),
     ):
         file = tmp_path / "mine.yaml"
         source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"

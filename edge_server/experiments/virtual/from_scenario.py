@@ -56,7 +56,9 @@ def build_deployment(
     """
     edge = read_config(scenario)
     source = source_config(scenario)
-    channel = channel_from_mapping(scenario.channel, f"{scenario.path}: channel", scenario.path.parent)
+    channel = channel_from_mapping(
+        scenario.channel, f"{scenario.path}: channel", scenario.path.parent, scenario.cameras
+    )
     try:
         policy = make_policy(edge.policy.name, edge.policy.value, scenario.rng("policy", edge.policy.name))
         field = field or _field(edge, scenario.seed)
