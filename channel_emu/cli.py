@@ -112,6 +112,8 @@ def _serve(
     from channel_emu.live.proxy import EmulatorFailed, ProxyOptions
     from channel_emu.model import trace
 
+    if args.trace and args.replay and args.trace.resolve() == args.replay.resolve():
+        raise ValueError(f"--trace {args.trace}: would overwrite what --replay reads: name another file")
     chosen = ProxyOptions(
         args.listen,
         args.to,

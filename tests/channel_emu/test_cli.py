@@ -65,6 +65,8 @@ def test_mistakes_get_one_line(capsys):
     ):
         said = refusal(capsys, main, "simulate", *words)
         assert why in said and said.startswith("channel-emu: ")
+    again = ["--to", "x:1", "--trace", "t.jsonl", "--replay", "./t.jsonl"]
+    assert "would overwrite what --replay reads" in refusal(capsys, main, "proxy", *again)
 
 
 @contextmanager
