@@ -72,6 +72,13 @@ def open_replay(scenario: Scenario, config: McapConfig, cameras: Sequence[str], 
         session = Session(path)
     if session.cut is not None:
         log.warning("%s", session.cut)
+    if len(cameras) < len(scenario.cameras):
+        log.warning(
+            "this node replays %d of %d cameras: a node with others begins at an instant of its own, and their frames "
+            "will not fit these in time; --all replays them together",
+            len(cameras),
+            len(scenario.cameras),
+        )
     if not session.frames:
         raise DatasetError(f"{path}: holds no frames of any camera")
     times = {name: _times(frames) for name, frames in session.frames.items()}

@@ -140,6 +140,7 @@ def test_frames_that_do_not_follow_are_left_out_and_said(tmp_path, caplog):
     with caplog.at_level(logging.WARNING):
         camera = camera_of(scenario)
     assert "cam01: 1 frames do not follow the one before in time" in caplog.text
+    assert "this node replays 1 of 3 cameras" in caplog.text
     schedule = camera.source.schedule(7)
     assert [schedule.due_ns(k) - 7 for k in range(3)] == [0, 10**9, 2 * 10**9] and schedule.next(2, 0) == (None, 0)
 
