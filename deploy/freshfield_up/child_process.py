@@ -7,13 +7,14 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from freshfield_up.launcher_constants import GRACE_S, LAST_LINES
+from freshfield_up.launcher_constants import GRACE_S, LAST_LINES, STOPPED_POLL_S
 
 # Asks Linux to end the process when its parent is gone (prctl's PR_SET_PDEATHSIG), and becomes the command. Not between
 # fork and exec: there a process with gRPC's threads may not run Python.
@@ -83,18 +84,18 @@ class Child:
         )
 
 
-def stop(children: Sequence[Child], grace_s: float = GRACE_S) -> None:
-    """Send SIGTERM to all at once, and SIGKILL to those still running after ``grace_s`` seconds."""
+def stop(children: Sequence[Child], grace_s: float = GRACE_S, hurry: threading.Event | None = None) -> None:
+    """Send SIGTERM to all at once, and SIGKILL to those still running after ``grace_s`` seconds, or once ``hurry`` is
+    set."""
+    hurry = hurry or threading.Event()
     for child in children:
         if child.running:
             child.process.send_signal(signal.SIGTERM)  # type: ignore[union-attr]
     deadline = time.monotonic() + grace_s
+    while any(child.running for child in children) and time.monotonic() < deadline and not hurry.wait(STOPPED_POLL_S):
+        pass
     for child in children:
-        if child.process is None:
-            continue
-        try:
-            child.process.wait(max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
+        if child.running:
             child.killed = True
             kill(child)
 

@@ -64,7 +64,7 @@ class Launcher:
         self._say = say
         self._signals: list[str] = []
         self._troubles_said: set[str] = set()
-        self._stop_requested = threading.Event()
+        self._stop_requested, self._hurry = threading.Event(), threading.Event()
         self._began_s = time.monotonic()
         self._ready_s: float | None = None
         self._page_announced = self._compiling_announced = False
@@ -210,16 +210,19 @@ class Launcher:
         return f"{int(now_s - self._ready_s)}{end} s"
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self._signals:
+            self._hurry.set()
         self._signals.append(signal.Signals(number).name)
         self._stop_requested.set()
 
     def _stop(self) -> None:
-        """Stop the node first and the edge last, so that frames on the way arrive. A second Ctrl-C kills."""
+        """Stop the node first and the edge last, so that frames on the way arrive. A second Ctrl-C kills what still
+        runs."""
         why = {"SIGINT": "Ctrl-C", "SIGTERM": "SIGTERM", "SIGHUP": "the terminal was closed"}
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
         self._say(f"stopping{reason}: cameras, channel, edge")
         for group in self.processes.groups:
-            stop(group, 0.0 if len(self._signals) > 1 else tuned.GRACE_S)
+            stop(group, tuned.GRACE_S, self._hurry)
             for child in group:
                 if child.killed:
                     self._say(f"{child.role} did not end in time and was killed; see {child.log}")

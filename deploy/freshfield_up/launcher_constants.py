@@ -17,6 +17,7 @@ REPORT_WITHIN_S = 300.0  # longest wait for the report at the end
 # --- the end of a process (launcher, child_process) ---
 # Time for a process to end after SIGTERM before it is killed: the edge server waits up to 20 s for its last update.
 GRACE_S = 30.0
+STOPPED_POLL_S = 0.05  # between two looks at whether a process that was told to end has ended
 LAST_LINES = 12  # that are shown of the log of a process that died
 
 # --- health of containers (healthy) ---

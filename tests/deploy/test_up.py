@@ -118,13 +118,18 @@ def test_a_trouble_is_said_once_for_each_camera_whatever_its_numbers(asleep, cap
     assert capfd.readouterr().out.splitlines() == [f"note: {line}" for line in said]
 
 
-def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep, capfd):
-    run = asleep("import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('up'); time.sleep(60)")
+def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep, capfd, monkeypatch):
+    """The second one also while the first is being obeyed; not killed, the node would end by itself."""
+    monkeypatch.setattr(launcher.tuned, "GRACE_S", 120.0)
+    stubborn = (
+        "import signal, time\nsignal.signal(signal.SIGTERM, lambda *_: print('told'))\nprint('up')\ntime.sleep(60)"
+    )
+    run = asleep(stubborn)
     log = run.processes.node.log
 
     def press_twice() -> None:
-        wait_until(lambda: log.exists() and "\nup\n" in log.read_text(), "no node")
-        for _ in range(2):
+        for word in ("up", "told"):
+            wait_until(lambda word=word: log.exists() and f"\n{word}\n" in log.read_text(), "no node")
             run._on_signal(signal.SIGINT, None)
 
     threading.Thread(target=press_twice, daemon=True).start()
