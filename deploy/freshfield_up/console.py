@@ -5,7 +5,6 @@ This file imports nothing of the commands until Ctrl-C is harmless, so it knows 
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import sys
@@ -21,6 +20,8 @@ def run(module: str) -> int:
     if catches := signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         # Within an import Ctrl-C would print a traceback; the default action just ends the process.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    import importlib  # only now: it takes a while itself
+
     main = importlib.import_module(module).main
     if catches:
         signal.signal(signal.SIGINT, signal.default_int_handler)
