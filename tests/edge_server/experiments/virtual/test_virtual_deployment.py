@@ -24,6 +24,7 @@ from edge_server.experiments.virtual.simulate_command import digest, main
 from edge_server.experiments.virtual.try_policy import try_policy
 from edge_server.experiments.virtual.virtual_deployment import VirtualDeployment
 from edge_server.report.build_report import build_report
+from edge_server.scheduler import Policy
 from edge_server.scheduler.learned.decision_record import read_decision
 from edge_server.scheduler.learned.learner_spec import Spec
 from edge_server.scheduler.learned.ppo import Learner
@@ -180,6 +181,12 @@ def test_a_policy_is_tried_from_a_library(tmp_path: Path):
     assert trial.policy == "freshest-k" and len(decided) > 2
     assert trial.ages_ms.tolist() == [list(row) for row in decided]
     assert trial.shown[:, 1].tolist() == [score.psnr_db for score in trial.scores] and trial.psnr_db > 5.0
+
+    class Mine(Policy):  # without a name, as on the page of plug-ins
+        def select(self, epoch, window):
+            return tuple(epoch.generated_ns)
+
+    assert try_policy(Mine(None, np.random.default_rng(0)), write(tmp_path), 0.5).policy == "Mine"
 
 
 def test_what_a_learned_policy_decided_and_what_scored_it_is_kept_as_of_a_live_run(tmp_path: Path, monkeypatch):
