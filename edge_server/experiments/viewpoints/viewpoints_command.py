@@ -127,17 +127,15 @@ def _run(args: argparse.Namespace) -> None:
 def read_budget(text: str) -> Budget:
     """Parse a budget: ``8`` is views, ``2.5m`` meters of path, ``8,2.5m`` both. Raises OptionError or
     ViewpointError."""
-    views: int | None = None
-    path_m: float | None = None
+    words = text.split(",")
     try:
-        for word in text.split(","):
-            if word.endswith("m"):
-                path_m = float(word[:-1])
-            else:
-                views = int(word)
+        views = [int(word) for word in words if not word.endswith("m")]
+        paths_m = [float(word[:-1]) for word in words if word.endswith("m")]
+        if len(views) > 1 or len(paths_m) > 1:
+            raise ValueError("two of a kind")
     except ValueError:
         raise OptionError(f"--budget {text}: expected views (8), meters (2.5m) or both (8,2.5m)") from None
-    return Budget(views, path_m)
+    return Budget(views[0] if views else None, paths_m[0] if paths_m else None)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -43,6 +43,7 @@ from tests.support import refusal, refused
         ("train-scheduler room --omegas 20,60", "select takes none"),
         ("train-scheduler room --kind wait --omegas 20,soon", "expected milliseconds such as"),
         ("viewpoints tile --budget many", "expected views"),
+        ("viewpoints tile --budget 8,9", "expected views"),
         ("viewpoints tile --budget 4 --travel nan", "--travel nan: expected 0 or more"),
         ("viewpoints tile --budget 4 --selector ppo:none.npz", "not a viewpoint policy"),
         ("viewpoints tower --budget 4", "its cameras look outward"),
