@@ -84,9 +84,9 @@ class StudyRequest:
         """The command that repeats this request, without folders and processes, which change nothing."""
         words = ["edge-server study", study, *(["--quick"] if self.quick else [])]
         words += [f"--seeds {self.seeds}"] if self.seeds else []
-        words += [f"--scene {','.join(self.scenes)}"] if self.scenes else []
+        words += [f"--scene {shlex.quote(','.join(self.scenes))}"] if self.scenes else []
         words += [f"--channel {shlex.quote(self.channel_given)}"] if self.channel is not None else []
-        words += [f"--case {case!r}" for case in self.cases]
+        words += [f"--case {shlex.quote(case)}" for case in self.cases]
         words += [f"--episodes {self.episodes}"] if self.episodes else []
         return " ".join(words)
 

@@ -206,6 +206,8 @@ def test_a_study_writes_rows_verdicts_and_a_page(tmp_path: Path):
     assert "`edge-server study metrics --quick --seeds 2`" in page
     assert "false discovery rate 5 %" in page and "](metrics.png)" in page and "local ghosting" in page
     assert "metrics-of-another" not in page
+    asked = request(tmp_path, scenes=("my scene.yaml",), cases=("one viewpoint",))
+    assert asked.command("mat").endswith(" --scene 'my scene.yaml' --case 'one viewpoint'")
     assert {row["case"] for row in csv.DictReader((tmp_path / "metrics.csv").open())} >= {"Gaussian blur"}
 
 
