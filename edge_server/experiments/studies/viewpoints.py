@@ -22,6 +22,7 @@ from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Scorer
 from edge_server.fields import Field
 from edge_server.matplotlib_figures import figure, label_lines
+from edge_server.viewpoints.candidates import ViewpointError
 from edge_server.viewpoints.capture_planner import Budget, Plan, Stop, plan_capture
 from edge_server.viewpoints.registry import make_selector
 
@@ -121,7 +122,13 @@ def capture(case: Capture, *, folders: Folders) -> list[Row]:
     planned once, and its beginnings are scored."""
     stage, work = stage_of(case.scene, case.work, folders), case.work
     scorer = Scorer(open_lpips(folders.lpips)[0], background=stage.background)
-    counts = [count for count in work.counts if count <= int(stage.candidates.reachable.sum())]
+    usable = int(stage.candidates.reachable.sum())
+    counts = [count for count in work.counts if count <= usable]
+    if not counts:
+        raise ViewpointError(
+            f"--scene {case.scene}: {usable} viewpoints to choose from, fewer than the {work.counts[0]} views of the "
+            "smallest capture: give a scene with more"
+        )
     made = plan(stage, case.arm, case.seed, counts[-1], work)
     rows = []
     for count in counts:

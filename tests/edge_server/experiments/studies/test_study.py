@@ -27,6 +27,7 @@ from edge_server.experiments.studies.trial import Trial, run_trial
 from edge_server.experiments.studies.verdicts import Claim, Finding, Verdict, interior, judge, trend
 from edge_server.scheduler import make_policy
 from edge_server.scheduler.learned.rewards import f_w
+from edge_server.viewpoints.candidates import ViewpointError
 from tests.edge_server.experiments.rollouts.small import RAW
 from tests.support import refused
 
@@ -343,6 +344,11 @@ def test_selectors_stand_in_a_table_of_each_scene():
 
 
 FEW_VIEWS, SOME = viewpoints.Workload((3, 8), 16, 3, 24), ("random", "coverage, short way")
+
+
+def test_a_scene_with_fewer_viewpoints_than_a_capture_has_is_refused():
+    case = viewpoints.Capture("random", "tile", 0, replace(FEW_VIEWS, candidates=2))
+    refused(ViewpointError, "2 viewpoints to choose from", viewpoints.capture, case, folders=Folders())
 
 
 @pytest.mark.slow
