@@ -94,4 +94,6 @@ def make_foreground(config: ForegroundConfig) -> Foreground:
         raise EmbeddingError(
             f"kinds: {detector.name} knows no {', '.join(sorted(unknown))}; it knows {', '.join(sorted(known))}"
         )
+    if not known and not all(kind.isdecimal() for kind in config.kinds):
+        raise EmbeddingError(f"kinds: {detector.name} names no classes: give their numbers, such as '15'")
     return Foreground(config, detector)

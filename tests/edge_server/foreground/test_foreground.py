@@ -155,11 +155,14 @@ def test_a_head_that_is_not_understood_is_refused_with_the_command_that_exports_
             decode(columns((*TILE, 0.9, kind, 5.0), cells=300), 0.5, "test", coefficients, 80, end_to_end=True)
 
 
-def test_models_without_masks_and_of_other_kinds_are_refused_by_what_they_are():
+def test_models_without_masks_and_of_other_kinds_are_refused_by_what_they_are(monkeypatch):
     for name, task in (("pose", "pose"), ("v5", "detect"), ("e2e_nms", "detect")):
         with pytest.raises(EmbeddingError, match=rf"{name}.onnx: gives no masks: it is a model of the task {task}"):
             make_foreground(ForegroundConfig(str(case_dir("02-yolo-end-to-end-export") / f"{name}.onnx")))
     refused(EmbeddingError, "knows no dog; it knows tile", make_foreground, ForegroundConfig("tile", kinds=["dog"]))
+    monkeypatch.setattr("edge_server.foreground.detector._kinds", lambda meta: {})
+    refused(EmbeddingError, "names no classes", make_foreground, ForegroundConfig("tile", kinds=["tile"]))
+    make_foreground(ForegroundConfig("tile", kinds=["0"]))
 
 
 @pytest.mark.stability
