@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edge_server.fields import Rendering, View
-from edge_server.fields.common.threads.thread_pool import Pool
 from edge_server.fields.field_constants import SAME_POSE
 from edge_server.fields.splat.layers import layer_constants as tuned
 from edge_server.fields.splat.layers.bump import degrees_of, find_turn
