@@ -451,11 +451,15 @@ class EdgeServer:
 
     def _leave_no_trace(self) -> None:
         """Close the files of a start that served nothing: edge.json and frontier.json, and with them the report, stay
-        those of an earlier run. A ledger without a frame goes."""
+        those of an earlier run. A ledger without a frame goes; one with frames that came before the page's port was
+        refused, say, is called so that it counts as no start of the run."""
         try:
             self._close_records()
-            if all(each.event == "closed" for each in LedgerReader(self.ledger.path)):
-                self.ledger.path.unlink()
+            path = self.ledger.path
+            if all(each.event == "closed" for each in LedgerReader(path)):
+                path.unlink()
+            else:
+                path.rename(path.with_name(f"ledger-edge-unserved-{self.start_ns}.tsv"))
         finally:
             self.journal.close(with_status=False)
 

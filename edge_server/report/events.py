@@ -27,8 +27,8 @@ def events(files: RunFiles) -> list[dict[str, Any]]:
 
 
 def _starts_ns(out: Path, last_ns: int) -> list[int]:
-    """When each process of the edge started, as its ledger is called; the last one first."""
-    found = {int(ns) for path in out.glob("ledger-edge-*.tsv") if (ns := path.stem.rpartition("-")[2]).isdecimal()}
+    """When each process of the edge that served started, as its ledger is called; the last one first."""
+    found = {int(ns) for path in out.glob("ledger-edge-edge-*.tsv") if (ns := path.stem.rpartition("-")[2]).isdecimal()}
     return [last_ns, *sorted((ns for ns in found if ns < last_ns), reverse=True)]
 
 

@@ -295,6 +295,11 @@ def test_every_port_beyond_this_machine_is_protected_or_named(tmp_path):
     refused(OSError, "taken", EdgeServer(made, read_config(made), page).run)
     # A start that fails is no process that was killed, takes no name, and leaves an earlier run's status and frontier.
     assert not read_all(tmp_path / "o") and not [*tmp_path.glob("*.mcap"), *tmp_path.glob("o/*.json")]
+    late = EdgeServer(made, read_config(made), page)
+    late.ledger.write(1, "cam01", "s", 0, "delivered")  # before the page was opened
+    refused(OSError, "taken", late.run)
+    (ledger,) = read_all(tmp_path / "o")
+    assert ledger.path.name == f"ledger-edge-unserved-{late.start_ns}.tsv" and len(list(ledger)) == 2
     named = server(transport=Transport(insecure=True))._warnings()
     assert [words.split(" on ")[0] for words in named] == ["gRPC", "page", "metrics"]
 

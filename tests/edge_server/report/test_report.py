@@ -206,6 +206,7 @@ def test_rows_are_in_order_of_time_also_across_a_restart(tmp_path):
     files = read_run_files(tmp_path / "again")
     assert files.restarts_s == [10.0] and [row.t_s for row in files.series] == pytest.approx([10.0 + published[0].t_s])
     (tmp_path / f"again/ledger-edge-edge-{50 * 10**9}.tsv").touch()
+    (tmp_path / f"again/ledger-edge-unserved-{90 * 10**9}.tsv").touch()  # its page could not be opened
     files.edge.started_ns = 100 * 10**9  # after 40 s in which no edge ran
     files.channel.changes = [ChannelChange(second * 10**9) for second in (54, 80, 103)]
     assert [event["t_s"] for event in events(files) if "network" in event["what"]] == [4.0, 10.0, 13.0]
