@@ -33,6 +33,11 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
             raise ScenarioError(
                 f"{scenario.path}: source.effects.{name}.cameras: {unknown[0]!r} is not one of the cameras"
             )
+        if shares := [each for each in (given or {}).get("cameras", ()) if scenario.path_of(each) != each]:
+            raise ScenarioError(
+                f"{scenario.path}: source.effects.{name}.cameras: {shares[0]} shows captures of "
+                f"{scenario.path_of(shares[0])}: name that one"
+            )
     if config.kind != "world" and (effects.delay or effects.mount):
         raise ScenarioError(
             f"{scenario.path}: source.effects: effects of the kinds delay and mount need source kind world"

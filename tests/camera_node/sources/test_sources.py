@@ -118,6 +118,8 @@ def test_a_held_out_frame_of_the_world_has_the_errors_of_the_camera_that_is_carr
     for listed, t_s in (({}, 0.4), ({"pose_delay": {"delay_ms": 40}}, 0.36)):
         assert whole(listed).capture(4).pose.matrix() == pytest.approx(walk.pose(t_s), abs=1e-9)
     refused(ScenarioError, "source.effects: hand is carried, and a bump", whole, {"bump": {}})
+    share = scenario({**WORLD, "effects": {"pose_noise": {"cameras": ["kept"]}}})
+    refused(ScenarioError, "kept shows captures of hand: name that one", cameras_of, share)
 
 
 def test_a_walk_repeats_after_a_lap_and_neither_jumps_nor_leaves_the_room():
