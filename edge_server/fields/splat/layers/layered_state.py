@@ -92,7 +92,7 @@ def unpack(field: Any, state: Arrays) -> None:
     field.still.load_state(_under("still.", state))
     field.static = StaticLayer(field.still)
     field.static.load_state(_under("static.", state))
-    field.supervision = StaticSupervision(field.static)
+    field.supervision = StaticSupervision(field.static, field.depth_network)
     if "depth.wrong" in state:
         field.supervision.make_depth().load_state(_under("depth.", state))
     field.cameras, field.observations, field.tracker = {}, Observations(), None

@@ -129,4 +129,6 @@ def test_the_field_learns_it_and_resumes_bit_for_bit() -> None:
     assert np.count_nonzero(seen_m[0]) > 1.4 * np.count_nonzero(seen_m[1])
     other.load_state(field.state())
     other.use_depth_network(_of_the_ball)
+    field.load_state(field.state())
+    assert field.supervision.network is not None, "a field keeps the network that it was given"
     same_state(*(RIG.run(each, range(16, 24), _measured, steps=5) for each in (field, other)))
