@@ -53,6 +53,13 @@ def rotate_to_camera(cam, x, y, z):
 
 
 @device_function
+def within_lens(cam, x, y):
+    """Whether a direction (x, y, 1) is about within the field of view (LENS_FIELD times it): farther aside the lens's
+    polynomial may fold back into the image."""
+    return (x >= cam[LIMITS]) & (x <= cam[LIMITS + 1]) & (y >= cam[LIMITS + 2]) & (y <= cam[LIMITS + 3])
+
+
+@device_function
 def lens_terms(cam, x, y, z):
     """The projection of a camera point through the lens, and what the Jacobian J and its gradient need:
     x / z, y / z, both clamped, projected u, v, the lens's first and second derivatives, 1 / z. J is taken at

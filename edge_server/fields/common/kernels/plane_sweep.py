@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from edge_server.fields import field_constants as tuned
-from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, distort, load_camera
+from edge_server.fields.common.kernels.camera import LENS, NEAR, ORIGIN, distort, load_camera, within_lens
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.rays import origin_of, pixel_direction
 from edge_server.fields.common.kernels.simd import fetch_add
@@ -38,7 +38,7 @@ def _pixels_of_row(cam, first, width, height, nowhere, row, pixels):
         depth = cam[6] * x + cam[7] * y + cam[8] * z
         over = _F1 / (depth if depth > cam[NEAR] else _F1)
         a, b = (cam[0] * x + cam[1] * y + cam[2] * z) * over, (cam[3] * x + cam[4] * y + cam[5] * z) * over
-        sees = (depth > cam[NEAR]) & (abs(a) < np.float32(4.0)) & (abs(b) < np.float32(4.0))
+        sees = (depth > cam[NEAR]) & within_lens(cam, a, b)
         through = distort(cam, a, b)
         px, py = cam[LENS] * through[0] + cam[LENS + 2], cam[LENS + 1] * through[1] + cam[LENS + 3]
         sees = sees & (px >= _F0) & (py >= _F0) & (px < width) & (py < height)

@@ -9,7 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from edge_server.fields.common.kernels.camera import LENS, ORIGIN, SIZE, distort, load_camera, rotate_to_camera
+from edge_server.fields.common.kernels.camera import (
+    LENS,
+    ORIGIN,
+    SIZE,
+    distort,
+    load_camera,
+    rotate_to_camera,
+    within_lens,
+)
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.splat import splat_constants as tuned
@@ -20,7 +28,6 @@ _UNSEEN, _NEVER = np.uint8(COST * tuned.SWEEP_UNSEEN), np.uint16(10 * COST)
 _PATHS = 4  # of a pass
 _ROWS = 8  # rows of pixels a task
 _AHEAD = np.float32(1e-3)  # least z of a direction that another camera sees
-_WIDEST = np.float32(4.0)  # largest x / z and y / z: far outside, the lens's polynomial folds back into the image
 _F0, _F1, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 
 
@@ -43,7 +50,7 @@ def _project_ray(camera, ray_x, ray_y, inverse, pixel, across, down):
         seen = z > _AHEAD
         over = _F1 / (z if seen else _F1)
         a, b = x * over, y * over
-        seen = seen & (abs(a) < _WIDEST) & (abs(b) < _WIDEST)
+        seen = seen & within_lens(camera, a, b)
         through = distort(camera, a, b)
         u = camera[LENS] * through[0] + camera[LENS + 2] - _HALF
         v = camera[LENS + 1] * through[1] + camera[LENS + 3] - _HALF

@@ -18,7 +18,7 @@ from edge_server.fields.splat.layers.depth.depth_plate import smooth
 from edge_server.fields.splat.layers.depth.surfaces import Surface
 from edge_server.fields.splat.layers.layer_constants import CHANGED
 from edge_server.fields.splat.stereo import match_depths
-from freshfield.geometry import Pinhole
+from freshfield.geometry import Pinhole, seen_from
 
 Image = NDArray[np.float32]
 
@@ -182,16 +182,14 @@ def _confirmed(k: int, lenses: Sequence[Pinhole], poses: Sequence[NDArray], inve
     there, rays = inverses[k] > 0, lenses[k].rays()
     depth = np.where(there, 1.0 / np.where(there, inverses[k], 1.0), 0.0)
     points = (rays * (depth / rays[..., 2])[..., None]) @ poses[k][:3, :3].T + poses[k][:3, 3]
-    agree = np.zeros(depth.shape, bool)
+    points, depth, agree = points.reshape(-1, 3), depth.ravel(), np.zeros(depth.size, bool)
     for j, (lens, pose) in enumerate(zip(lenses, poses)):
         if j == k:
             continue
-        local = (points - pose[:3, 3]) @ pose[:3, :3]
-        with np.errstate(invalid="ignore"):
-            at = lens.project(local)
-            inside = there & np.all((at >= 0) & (at < (lens.width, lens.height)), axis=-1)
-        column, row = np.where(inside[..., None], at, 0.0).astype(np.int64).transpose(2, 0, 1)
-        ratio = np.where(inside, local[..., 2], 1.0) * inverses[j][row, column]
+        local, at, inside = seen_from(lens, pose, points)
+        inside &= there.ravel()
+        column, row = np.where(inside[:, None], at, 0.0).astype(np.int64).T
+        ratio = np.where(inside, local[:, 2], 1.0) * inverses[j][row, column]
         near = np.abs(np.log(np.maximum(ratio, 1e-9))) < tuned.SWEEP_AGREE
         agree |= inside & near & (depth <= _parallax_px(poses[k], pose, lens) / tuned.SWEEP_FAR_PX)
-    return np.where(agree, inverses[k], np.float32(0.0))
+    return np.where(agree.reshape(there.shape), inverses[k], np.float32(0.0))

@@ -1,16 +1,26 @@
 """The kernels of stereo against plain numpy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
 from edge_server.fields.common.camera_rows import camera_rows
+from edge_server.fields.common.kernels.plane_sweep import _pixels_of_row
 from edge_server.fields.common.scene_box import UNIT_BOX
 from edge_server.fields.common.threads.thread_pool import CallerPool, Pool
 from edge_server.fields.splat import splat_constants as tuned
-from edge_server.fields.splat.kernels.semi_global import COST, UNKNOWN, aggregate_paths, choose_depths, match_costs
-from freshfield.geometry import Pinhole, look_at, se3_inverse
+from edge_server.fields.splat.kernels.semi_global import (
+    COST,
+    UNKNOWN,
+    _project_ray,
+    aggregate_paths,
+    choose_depths,
+    match_costs,
+)
+from freshfield.geometry import Pinhole, look_at, se3_inverse, seen_from
 
 WIDTH, HEIGHT, STEPS = 21, 18, 11
 LENS = Pinhole(WIDTH, HEIGHT, 19.0, 20.0, 10.2, 9.1, (0.05, -0.02, 0.004, 0.003))
@@ -22,8 +32,8 @@ def _difference(image: NDArray, other: NDArray, to_other: NDArray, d: int) -> tu
     """Cost of one inverse depth (H, W) by another image, and where that shows it."""
     rays = LENS.rays() / LENS.rays()[..., 2:]
     local = rays @ to_other[:3, :3].T + INVERSE[d] * to_other[:3, 3]
-    u, v = np.moveaxis(LENS.project(local), -1, 0) - 0.5
-    seen = (u > -0.5) & (v > -0.5) & (u < WIDTH - 0.5) & (v < HEIGHT - 0.5)
+    _, at, inside = seen_from(LENS, np.eye(4), local.reshape(-1, 3))
+    (u, v), seen = at.T.reshape(2, HEIGHT, WIDTH) - 0.5, inside.reshape(HEIGHT, WIDTH)
     u, v = np.clip(np.where(seen, u, 0), 0, WIDTH - 1), np.clip(np.where(seen, v, 0), 0, HEIGHT - 1)
     x, y = np.minimum(u.astype(int), WIDTH - 2), np.minimum(v.astype(int), HEIGHT - 2)
     fu, fv = u - x, v - y
@@ -71,6 +81,20 @@ def test_costs_are_those_of_the_images_that_differ_least(images: NDArray[np.floa
     pool = Pool(3)
     np.testing.assert_array_equal(_costs(images[:count], pool), found)
     pool.close()
+
+
+def test_nothing_far_aside_is_seen_where_the_lens_folds_it_back() -> None:
+    """By stereo, and by the sweep of cells."""
+    lens = replace(Pinhole.from_fov(64, 48, 50.0), distortion=(-0.25, 0.0, 0.0, 0.0))
+    camera, aside = tuple(camera_rows([np.eye(4)], [lens], UNIT_BOX)[0]), np.linspace(0.0, 3.9, 14, dtype=np.float32)
+    swept, matched, pixel, place = np.zeros(14, np.int32), [], np.zeros(1, np.int32), np.zeros((2, 1), np.float32)
+    cells = np.stack([aside, np.zeros_like(aside), np.ones_like(aside)])
+    _pixels_of_row(camera, np.int32(0), np.int32(64), np.int32(48), np.int32(-1), cells, swept)
+    for x in aside:
+        _project_ray(camera, x, np.float32(0.0), np.ones(1, np.float32), pixel, *place)
+        matched.append(pixel[0])
+    for found in (swept, np.array(matched)):
+        assert (found[:2] >= 0).all() and (found[2:] == -1).all()
 
 
 def _paths(cost: NDArray[np.uint8], gray: NDArray[np.float32]) -> NDArray[np.int64]:

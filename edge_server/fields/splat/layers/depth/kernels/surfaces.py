@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields.common.kernels.camera import LENS, ORIGIN, distort, load_camera, rotate_to_camera
+from edge_server.fields.common.kernels.camera import LENS, ORIGIN, distort, load_camera, rotate_to_camera, within_lens
 from edge_server.fields.common.kernels.jit import device_function, kernel
 from edge_server.fields.common.kernels.simd import fetch_add
 from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
@@ -110,9 +110,7 @@ def _look(meshes, k, x, y, z):
     through_lens = distort(cam, a * over, b * over)
     u, v = cam[LENS] * through_lens[0] + cam[LENS + 2], cam[LENS + 1] * through_lens[1] + cam[LENS + 3]
     agree, through, r, g, bl, nx, ny, nz = _F0, _F0, _F0, _F0, _F0, _F0, _F0, _F0
-    # Outside the field of view the lens polynomial may lead back into the image.
-    inside = (a * over > cam[LENS + 8]) & (a * over < cam[LENS + 9]) & (b * over > cam[LENS + 10])
-    inside = inside & (b * over < cam[LENS + 11]) & (u >= _F0) & (v >= _F0) & (u < width) & (v < height)
+    inside = within_lens(cam, a * over, b * over) & (u >= _F0) & (v >= _F0) & (u < width) & (v < height)
     if inside & (d > np.float32(tuned.NEAREST_M)):
         u = min(max(u - _HALF, _F0), np.float32(width) - np.float32(1.001))
         v = min(max(v - _HALF, _F0), np.float32(height) - np.float32(1.001))
