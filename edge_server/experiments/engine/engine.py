@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -178,7 +179,9 @@ def _in_processes(
     import joblib
 
     start = threads or max(1, usable_cores() // jobs), threads is not None
-    # New processes inherit the mask: Ctrl-C is for this one, which then ends them.
+    # New processes inherit the mask: Ctrl-C is for this one, which then ends them. Python 3.11's tracker of resources
+    # unblocks SIGINT where it is started with the first of them.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         with joblib.parallel_config("loky", initializer=_init_worker, initargs=start):

@@ -106,6 +106,9 @@ def test_however_it_ends_its_processes_end_too_and_what_was_finished_is_kept(how
 
     wait_until(lambda: len(workers()) == 2, "its processes do not start", 120.0)
     wait_until((tmp_path / "r.jsonl").read_text, "the first result is not kept", 60.0)
+    for pid in workers():  # SIGINT is blocked: while a process starts, it would leave a traceback
+        blocked = Path(f"/proc/{pid}/status").read_text().split("SigBlk:")[1].split()[0]
+        assert int(blocked, 16) >> (signal.SIGINT - 1) & 1
     if how == signal.SIGINT:
         os.killpg(parent.pid, how)  # as a terminal does: to all of them
     else:
