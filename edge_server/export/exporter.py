@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -118,9 +118,10 @@ class Exporter:
 
     def _splats(self, path: Path) -> None:
         from edge_server.export.splats import write_splats
+        from edge_server.fields.splat.snapshot import SplatSnapshot
 
-        snapshot: Any = self._field.snapshot()
-        if not hasattr(snapshot, "gaussians"):
+        snapshot = self._field.snapshot()
+        if not isinstance(snapshot, SplatSnapshot):
             raise ExportError(f"--splats: {self._name} has no Gaussians: use a run or fit of field splat")
         self._say(f"{path}: {write_splats(path, snapshot.params, snapshot.box)} Gaussians")
 

@@ -65,7 +65,8 @@ def explain(actor: Actor, state: State, action: Any) -> Explanation:
         logit=float(logits[0]),
         baseline_logit=float(logits[1]),
         parts=_part_shares(actor, features, baseline, action),
-        cameras=logits[0] - logits[2:],
+        # One that has not reported is an average one already, but equal states of a batch may round differently.
+        cameras=np.where(features[:, -1] > 0, logits[0] - logits[2:], 0.0),
         names=names,
     )
 

@@ -132,7 +132,7 @@ def test_points_are_the_gaussians_that_are_seen(served):
     params[1, 10] = -4.0  # haze
     params[2, 3:6] = -6.0  # too small among so many
     box = SceneBox((1.0, 2.0, 3.0), 2.0, 0.1, True, 2.0, 0.01)
-    field = SplatSnapshot(box, SimpleNamespace(params=params), np.zeros(3, np.float32), None, 1)
+    field = SplatSnapshot(box, params, np.zeros(3, np.float32), None, 1)
     points = point_cloud(field)
     assert len(points) == MOST_POINTS and points["x"][0] == pytest.approx(1.0 + 2.0 * params[3, 0])
     assert (points["red"][0], points["green"][0], points["blue"][0]) == (255, 128, 0)

@@ -152,7 +152,7 @@ def test_what_cannot_be_used_is_said_and_costs_nothing_else(tmp_path):
     assert "5 captures cannot be read whole, first hand/0000: the nearest pose" in found.notes[0]
     refused(OptionError, "says its scale", open_still, file, scale=2.0)
     (tmp_path / "poses.txt").write_text("100 0 0 0 0 0 0 1\n")
-    refused(DatasetError, "none of its captures can be used", open_still, file)
+    refused(DatasetError, "files.hand: no frame is within max_gap_ms of a pose: give .* start_s", open_still, file)
     with pytest.raises(DatasetError, match=r"film.mp4: its lens and poses are not known: .* --like video"):
         open_still(tmp_path / "film.mp4")
     refused(DatasetError, "one training camera", open_still, _scenario(tmp_path, kind="world", scene="room"))
