@@ -14,7 +14,7 @@ from edge_server.fields.common.cameras.pose_corrections import PoseCorrections
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 from edge_server.fields.splat.carried_camera.pose_alignment import gray
 from edge_server.fields.splat.carried_camera.scan_field import Shown
-from freshfield.geometry import se3_inverse, so3_log
+from freshfield.geometry import se3_inverse, seen_from, so3_log
 
 Array = NDArray[np.float64]
 
@@ -27,18 +27,15 @@ def moved_in(now: View, pose: Array, before: View, before_pose: Array) -> NDArra
     z = now.depth[::every, ::every].astype(np.float64)
     y, x = np.mgrid[: z.shape[0], : z.shape[1]] * every
     ray = lens.rays(np.stack([x + 0.5, y + 0.5], axis=-1))
-    to_other = se3_inverse(before_pose) @ pose
-    points = ray / ray[..., 2:] * z[..., None] @ to_other[:3, :3].T + to_other[:3, 3]
-    ahead = points[..., 2]
-    safe = np.maximum(ahead, 1e-6)
-    u = np.floor(other.fx * points[..., 0] / safe + other.cx).astype(np.int64)
-    v = np.floor(other.fy * points[..., 1] / safe + other.cy).astype(np.int64)
-    there = (z > 0) & (ahead > 1e-3) & (u >= 0) & (v >= 0) & (u < other.width) & (v < other.height)
+    points = (ray / ray[..., 2:] * z[..., None]).reshape(-1, 3)
+    local, at, inside = seen_from(other, se3_inverse(pose) @ before_pose, points)
+    ahead = local[:, 2].reshape(z.shape)
+    there = (z > 0) & (ahead > 1e-3) & inside.reshape(z.shape)
+    u, v = np.where(inside[:, None], at, 0.0).astype(np.int64).T.reshape(2, *z.shape)
     # The nearest surface around: edges, and errors of poses, are no free space.
     known = np.where(before.depth > 0, before.depth, np.float32(0.0))
     nearest = cv2.erode(known, np.ones((2 * every + 1, 2 * every + 1), np.uint8))
-    seen = nearest[np.clip(v, 0, other.height - 1), np.clip(u, 0, other.width - 1)]
-    through = there & (seen > ahead * (1.0 + tuned.MOVED_SHARE) + tuned.MOVED_M)
+    through = there & (nearest[v, u] > ahead * (1.0 + tuned.MOVED_SHARE) + tuned.MOVED_M)
     kernel = np.ones((3, 3), np.uint8)
     found = cv2.dilate(cv2.morphologyEx(through.astype(np.uint8), cv2.MORPH_OPEN, kernel), kernel)
     size = (now.image.shape[1], now.image.shape[0])

@@ -83,6 +83,11 @@ def test_what_has_come_is_told_from_what_was_not_seen_before() -> None:
     found = moved_in(replace(now, depth=depth), there, before, np.eye(4))
     assert found[45:75, 65:105].mean() > 0.95 and found[:30].mean() < 0.02
     assert not moved_in(now, there, replace(before, depth=depth), np.eye(4))[:, :40].any()
+    barrel = replace(WALL.scaled(4.0), distortion=(-0.2, 0.0, 0.0, 0.0))
+    column = np.full((barrel.height, barrel.width), 2.0, np.float32)
+    column[:, 60:160] = 1.0  # near the edge, where the lens shows it 12 pixels further in
+    same = View("hand", np.zeros((*column.shape, 3), np.uint8), np.eye(4), barrel, depth=column)
+    assert not moved_in(same, np.eye(4), same, np.eye(4)).any()
 
 
 @pytest.mark.stability
