@@ -1,6 +1,6 @@
 """Numbers of recorded data sets and of real cameras."""
 
-# --- photos (datasets.streamer) ---
+# --- photos (held_out_captures) ---
 HOLD_OUT_EVERY = 8  # of so many photos the first is held out, where the data set has no test images of its own
 
 # --- sizes of images (datasets.photo, datasets.dynerf, datasets.rgbd.depth_file, datasets.image_reading) ---
@@ -39,7 +39,7 @@ RECORDING_POSE_NEAR_NS = 50_000_000
 # The same of the transforms above: robots correct map -> odom only some times a second, and by little.
 RECORDING_PARENTS_NEAR_NS = 250_000_000
 
-# --- cameras (devices.live, camera_node.doctor.doctor_command) ---
+# --- cameras (devices.live) ---
 # Pauses before a camera that failed is opened again: after the first failure, the second, ...
 REOPEN_AFTER_S = (0.25, 0.5, 1.0, 2.0, 5.0)
 # Longest wait of a capture for a new frame: seconds, and share of the time between two captures.

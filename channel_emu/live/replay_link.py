@@ -15,9 +15,9 @@ _NOT_RECORDED = Record("", "", 0, 0, 0, 0, None, None, 0, None, None, None, None
 class ReplayLink(Link):
     """A link that repeats a recording instead of making decisions.
 
-    Offer ``n`` gets the recorded outcome of offer ``n``, with the recorded delay after its offer. Offers at
-    the recorded instants reproduce the recording exactly. After the last record it continues with the first.
-    An offer whose record a killed recording lost is dropped, so that those after it keep their records.
+    Offer ``n`` gets the recorded outcome of the ``n``-th offer from the first record on, with the recorded delay after
+    its offer. Offers at the recorded instants reproduce the recording exactly. After the last record it continues with
+    the first. An offer whose record a killed recording lost is dropped, so that those after it keep their records.
 
     records: of this camera, in the order of their numbers. Raises TraceError if there are none.
     """
@@ -27,7 +27,7 @@ class ReplayLink(Link):
             raise TraceError(f"the trace holds no frame of {camera}")
         super().__init__(camera, "parallel", ServiceTime(replayed([0.0]), [0.0], None))
         self._records = {record.number: record for record in records}
-        self._count = records[-1].number + 1
+        self._first, self._count = records[0].number, records[-1].number + 1 - records[0].number
 
     def _arrive(self, transit: Transit, at_ns: int) -> None:
         record, shift = self._record_of(transit)
@@ -60,7 +60,7 @@ class ReplayLink(Link):
 
     def _record_of(self, transit: Transit) -> tuple[Record, int]:
         """The record of an offer, and how much later the offer is than the recorded one."""
-        record = self._records.get(transit.number % self._count, _NOT_RECORDED)
+        record = self._records.get(self._first + transit.number % self._count, _NOT_RECORDED)
         return record, transit.offered_ns - record.offered_ns
 
     def _end_of(self, transit: Transit) -> tuple[EventKind, int]:

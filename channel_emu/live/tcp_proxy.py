@@ -106,7 +106,7 @@ class TcpProxy(Proxy):
         if words := self.options.transport.guard(host, "TCP"):
             log.warning("--insecure: %s", words)
         try:
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
             self._socket = socket.create_server((host, port), family=family)
         except OSError as error:
             raise TransportError(f"cannot listen on {self.options.listen}: {error.strerror or error}") from None

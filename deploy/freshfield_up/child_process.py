@@ -7,10 +7,9 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -84,16 +83,15 @@ class Child:
         )
 
 
-def stop(children: Sequence[Child], grace_s: float = GRACE_S, hurry: threading.Event | None = None) -> None:
-    """Send SIGTERM to all at once, and SIGKILL to those still running after ``grace_s`` seconds, or once ``hurry`` is
-    set."""
-    hurry = hurry or threading.Event()
+def stop(children: Sequence[Child], grace_s: float = GRACE_S, hurry: Callable[[], bool] = bool) -> None:
+    """Send SIGTERM to all at once, and SIGKILL to those still running after ``grace_s`` seconds, or once ``hurry``
+    says so; without one it never does."""
     for child in children:
         if child.running:
             child.process.send_signal(signal.SIGTERM)  # type: ignore[union-attr]
     deadline = time.monotonic() + grace_s
-    while any(child.running for child in children) and time.monotonic() < deadline and not hurry.wait(STOPPED_POLL_S):
-        pass
+    while any(child.running for child in children) and time.monotonic() < deadline and not hurry():
+        time.sleep(STOPPED_POLL_S)
     for child in children:
         if child.running:
             child.killed = True

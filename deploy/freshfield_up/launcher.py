@@ -64,7 +64,7 @@ class Launcher:
         self._say = say
         self._signals: list[str] = []
         self._troubles_said: set[str] = set()
-        self._stop_requested, self._hurry = threading.Event(), threading.Event()
+        self._stop_requested, self._hurry = threading.Event(), False
         self._began_s = time.monotonic()
         self._ready_s: float | None = None
         self._page_announced = self._compiling_announced = False
@@ -210,8 +210,9 @@ class Launcher:
         return f"{int(now_s - self._ready_s)}{end} s"
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self._signals:
-            self._hurry.set()
+        # A flag, since an event that is set where its own thread waits for it may never return; and Ctrl-C alone, since
+        # a terminal that is closed sends SIGHUP twice.
+        self._hurry |= bool(self._signals) and number == signal.SIGINT
         self._signals.append(signal.Signals(number).name)
         self._stop_requested.set()
 
@@ -222,7 +223,7 @@ class Launcher:
         reason = f" ({why[self._signals[0]]})" if self._signals else ""
         self._say(f"stopping{reason}: cameras, channel, edge")
         for group in self.processes.groups:
-            stop(group, tuned.GRACE_S, self._hurry)
+            stop(group, tuned.GRACE_S, lambda: self._hurry)
             for child in group:
                 if child.killed:
                     self._say(f"{child.role} did not end in time and was killed; see {child.log}")

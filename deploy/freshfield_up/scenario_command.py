@@ -49,6 +49,10 @@ def _show(args: argparse.Namespace) -> int:
     return 0
 
 
+def _has_files_of(folder: Path, shipped: Path) -> bool:
+    return all((folder / file.relative_to(shipped)).is_file() for file in shipped.rglob("*") if file.is_file())
+
+
 def _init(args: argparse.Namespace) -> int:
     model = load(args.like)
     name = args.file.stem
@@ -58,6 +62,8 @@ def _init(args: argparse.Namespace) -> int:
     folders = []  # of files that the scenario names
     if model.path.parent == SCENARIO_FOLDER:
         folders = [folder for folder in SCENARIO_FOLDER.iterdir() if folder.is_dir() and f" {folder.name}/" in text]
+        # Those of an earlier file, which may have been changed, serve this one as well.
+        folders = [folder for folder in folders if not _has_files_of(args.file.parent / folder.name, folder)]
     for target in (args.file, *(args.file.parent / folder.name for folder in folders)):
         if target.exists():
             raise ScenarioError(f"{target}: exists; choose another name or folder, or remove it first")

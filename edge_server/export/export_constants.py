@@ -8,7 +8,7 @@ POINTS = 20_000  # unless told otherwise, as in a sparse model of usual size: mo
 PIXELS_A_POINT = 1000
 SAME = 0.01  # two depth maps see the same point if depth differs by less, as a share of the distance
 
-# --- renderings (viewed_field, images, render_command, camera_paths) ---
+# --- renderings (viewed_field, images_and_video, render_command, camera_paths) ---
 DEFAULT_HEIGHT_PX = 480  # of a rendering, at the shape of the cameras' images
 RENDERED_FPS = 25.0  # images a second of a film, unless told otherwise
 # Percentiles of nearness (1 / depth) that are the ends of the colors of depth, and number of images of a path that they

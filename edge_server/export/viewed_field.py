@@ -119,8 +119,12 @@ class ViewedField:
 
     def pose(self, view: View) -> NDArray[np.float64]:
         """Camera to world (4, 4) of a view, corrected where the field corrects it."""
-        known = self.field.correction(view) if isinstance(self.field, RefinesCameras) else None
-        return np.asarray(view.camera_to_world if known is None else known.camera_to_world, np.float64)
+        if isinstance(self.field, RefinesCameras):
+            known = self.field.correction(view)
+            pose = None if known is None else known.camera_to_world
+        else:  # fields of rays learn the poses of their own views alone
+            pose = self.field.learned_pose(view) if hasattr(self.field, "learned_pose") else None
+        return np.asarray(view.camera_to_world if pose is None else pose, np.float64)
 
 
 def checked_size(size: Sequence[int]) -> tuple[int, int]:

@@ -62,7 +62,6 @@ MOST_PENDING = 8  # publications that wait for their truth: more means that no h
 GAP_PERIODS = 0.55
 
 # --- scores: what they may cost (scoring.scoring_thread) ---
-FIELD_NICE = 5  # of the field's workers, in a server that answers cameras meanwhile
 SCORING_NICE = 5  # niceness: scoring serves observers and gives way to the field's updates
 WAITING_FRAMES = 256  # held-out frames that wait while one publication is scored; older ones are not needed
 WAITING_PUBLICATIONS = 2  # publications that wait while another one is scored; the oldest of more is left out
@@ -92,7 +91,10 @@ MOST_QUEUED_BYTES, MOST_QUEUED = 64 * 2**20, 4096
 RECORD_EVERY_S = 0.05  # between two looks of the recorder at an empty queue
 MESSAGE_BYTES = 1024  # that a message in the queue counts beside its payloads
 
-# --- what is told of a run (server, state, ingest, grpc_services, frontier) ---
+# --- the field (server) ---
+FIELD_NICE = 5  # niceness of its workers, in a server that answers cameras meanwhile
+
+# --- what is told of a run (server, state, ingest, grpc_services, best_update_time) ---
 STATUS_PERIOD_S, AGES_PERIOD_S = 0.5, 0.2  # between two writings of the status; of the cameras' ages
 SNAPSHOT_TIMEOUT_S = 30.0  # who asks for a snapshot waits so long for the update in progress
 MAX_SNAPSHOTS = 20  # in the folder of a run: a user who requests more is told to move some away
@@ -102,7 +104,7 @@ MOST_EVENTS = 200  # latest ones that are kept: each is in every edge.json
 SHOWN_OF = 30  # latest scored instants and updates that ``EdgeState.present`` averages
 KEPT_PUBLICATIONS = 4096  # latest publications that ``EdgeState`` keeps
 WATCH_S = 0.05  # between two looks of the operator service at new decisions; updates take hundreds of milliseconds
-USUAL_SPEED_M_PER_S = 1.0  # assumed of a scene whose speed is not given (``frontier``): a person walking
+USUAL_SPEED_M_PER_S = 1.0  # assumed of a scene whose speed is not given (``best_update_time``): a person walking
 
 # --- watchers of a run and of its metrics (grpc_services, output.guarded_http) ---
 MAX_WATCHERS = 32  # of decisions at once; each looks at the state twenty times a second

@@ -36,7 +36,6 @@ from edge_server.live.state import CameraView, Comparison, Controls, EdgeState, 
 from edge_server.machine import run_facts
 from edge_server.run_records import DepthCounts, DepthStatus, EdgeStatus, UpdateCounts
 from edge_server.scheduler import LivePolicies, short_name
-from edge_server.scheduler.learned.decision_record import DecisionWriter
 from edge_server.settings import EdgeConfig, cameras_move, described, embedding_for, read_config
 from freshfield.clock import WallClock
 from freshfield.files import read_status, write_json
@@ -45,8 +44,9 @@ from freshfield.scenario import Scenario, ScenarioError
 from freshfield.transport import Transport, host_port
 from freshfield.untrusted import stored_bytes
 
-if TYPE_CHECKING:  # imported at run time only where a run is recorded
+if TYPE_CHECKING:  # imported at run time only where a run is recorded, and where a policy is learned
     from edge_server.live.output.recorder import Recorder
+    from edge_server.scheduler.learned.decision_record import DecisionWriter
 
 log = logging.getLogger(__name__)
 
@@ -168,7 +168,7 @@ class EdgeServer:
             earlier.last_frames,
             scenario.codec,
         )
-        self._decisions = DecisionWriter(options.out, embedding_for(config, policy))
+        self._decisions: DecisionWriter | None = None
         controls = Controls(policy.name, policy.value)
         self.loop = UpdateLoop(
             self.updater,
@@ -292,10 +292,21 @@ class EdgeServer:
             counts.refused[camera] = counts.refused.get(camera, 0) + 1
         self.state.publish(publication, renderer)
         self.journal.published(publication)
-        self._decisions.record(self.updater.policy, publication.number)
+        self._record_decision(publication.number)
         if self.recorder is not None:
             self.recorder.published(publication)
         self.scoring.published(publication, renderer, views)
+
+    def _record_decision(self, number: int) -> None:
+        """Keep what a learned policy decided, for ``edge-server explain``."""
+        policy = self.updater.policy
+        if policy.last_decision is None:
+            return
+        if self._decisions is None:
+            from edge_server.scheduler.learned.decision_record import DecisionWriter
+
+            self._decisions = DecisionWriter(self.options.out, embedding_for(self.config, policy))
+        self._decisions.record(policy, number)
 
     def _scored(self, publication: Publication, comparison: Comparison | None, final: bool) -> None:
         self.state.scored(publication, comparison)
@@ -396,7 +407,7 @@ class EdgeServer:
             "streams_ended": self.ingest.streams.ended,
             "two_nodes": dict(self.ingest.admission.doubled),
             "lines_lost": self.journal.lines_lost + self.ledger.lines_lost,
-            "decisions_lost": self._decisions.lost,
+            "decisions_lost": self._decisions.lost if self._decisions else 0,
             "last_frames": self.ingest.admission.last_frames(),
             "stale_on_arrival": self.buffer.stale_on_arrival,
             "check_ms": {f"p{p}": percentile(self.ingest.check_ms, p) for p in (50, 99)},

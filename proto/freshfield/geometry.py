@@ -359,8 +359,8 @@ class Pinhole:
         )
 
     def _undistort(self, xd: Array, yd: Array) -> tuple[Array, Array]:
-        """The point that the lens shows at (xd, yd). Two of Newton's steps end what is left of ``_nearly_undistorted``:
-        of wide lenses up to a pixel at the corners."""
+        """The point that the lens shows at (xd, yd). Two of Newton's steps end what is left of ``_nearly_undistorted``,
+        of wide lenses up to a pixel at the corners; near a fold they lead astray, and are not taken."""
         k1, k2, p1, p2 = self.distortion
         x, y = self._nearly_undistorted(xd, yd)
         for _ in range(2):
@@ -372,7 +372,11 @@ class Pinhole:
             yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
             at_x, at_y = self._distort(x, y)
             ex, ey, determinant = at_x - xd, at_y - yd, xx * yy - xy * xy
-            x, y = x - (yy * ex - xy * ey) / determinant, y - (xx * ey - xy * ex) / determinant
+            with np.errstate(all="ignore"):
+                stepped = x - (yy * ex - xy * ey) / determinant, y - (xx * ey - xy * ex) / determinant
+                at_x, at_y = self._distort(*stepped)
+                nearer = np.hypot(at_x - xd, at_y - yd) < np.hypot(ex, ey)
+            x, y = np.where(nearer, stepped[0], x), np.where(nearer, stepped[1], y)
         return x, y
 
     def _nearly_undistorted(self, xd: Array, yd: Array) -> tuple[Array, Array]:

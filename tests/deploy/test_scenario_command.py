@@ -62,6 +62,7 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
     if name in ("cell", "scan"):
         scenario = load(mine)
         assert load_hand_eyes(scenario, source_config(scenario).arm, ["hand"])["hand"].setup == "eye-in-hand"
+        printed(capsys, "scenario", "init", str(mine.with_name("other.yaml")), "--like", name)
     assert "exists" in refused(capsys, "scenario", "init", str(mine))
     assert mine.read_text() == text
     assert "expected a name" in refused(capsys, "scenario", "init", str(tmp_path / "a: b.yaml"))

@@ -145,6 +145,11 @@ def test_rays_undo_projection(camera, seed):
     np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-12)
     wide = Pinhole(640, 480, 400, 400, 320, 240, (-0.22, 0.03, 1e-3, -1e-3))  # nearly folds at its corners
     np.testing.assert_allclose(wide.project(wide.rays([[0, 0], [640, 480]])), [[0, 0], [640, 480]], atol=1e-6)
+    folds = Pinhole(
+        64, 48, 58.772257, 58.772257, 30.759072, 22.351561, (-0.23285114, -0.07019271, 1.09234e-3, 4.09036e-4)
+    )
+    assert geometry.invertible(folds)
+    assert np.abs(folds.project(folds.rays([[64, 48]])) - [[64, 48]]).max() < 1, "on the fold"
 
 
 @given(st.integers(8, 200), st.integers(8, 200), st.floats(20, 120), st.sampled_from([0.25, 0.5, 1 / 3, 2.0]))

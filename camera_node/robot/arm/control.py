@@ -51,15 +51,18 @@ def stop_event() -> threading.Event:
 
 def stop_within_timeout(stop: Callable[[], None], host: str) -> None:
     """Call ``stop`` to stop the arm at ``host``, but give up after ``STOPPING_S``: the library has no timeout. Raises
-    ArmError then, unless another error is on its way already."""
+    ArmError then; where another error is on its way already, says it beside that."""
     # The default action ends this process even if the library holds Python's lock.
     signal.setitimer(signal.ITIMER_REAL, 2 * STOPPING_S)
     thread = threading.Thread(target=stop, daemon=True)
     thread.start()
     thread.join(STOPPING_S)
     signal.setitimer(signal.ITIMER_REAL, 0)
-    if thread.is_alive() and sys.exception() is None:
-        raise ArmError(f"arm at {host}: it has not confirmed its stop within {STOPPING_S:g} s: does it stand still?")
+    if thread.is_alive():
+        unconfirmed = f"arm at {host}: it has not confirmed its stop within {STOPPING_S:g} s: does it stand still?"
+        if sys.exception() is None:
+            raise ArmError(unconfirmed)
+        print(f"camera-node: {unconfirmed}", file=sys.stderr, flush=True)
 
 
 def joints_in_motion(stream: ArmStream) -> np.ndarray:

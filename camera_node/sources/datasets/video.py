@@ -24,7 +24,6 @@ from camera_node.sources.datasets.records import (
     file_within,
     find_files,
 )
-from freshfield import payload  # noqa: F401  (sets OpenCV's size limit before cv2 is imported)
 from freshfield.geometry import Pinhole
 
 FILES = ("calib*.json", "rig*.json")  # a folder's rig*.json counts where it has no calib*.json
@@ -196,7 +195,9 @@ class Clip:
                 found = self._capture.grab()
                 stamp_ms = self._capture.get(cv2.CAP_PROP_POS_MSEC)
                 self._next = int(np.abs(self._from_first_ms - stamp_ms).argmin()) + 1
-            if not found or self._next > index:  # too far, or a container without an index: decode forward
+            if self._next > index or (
+                self._stamped and not found
+            ):  # too far, or back, without an index: decode forward
                 self._capture.release()
                 self._capture, self._next = self._open(), 0
         while self._next < index and self._capture.grab():

@@ -131,8 +131,9 @@ class Fit(ViewedField):
         usage = self._load_meter.row(0.0)
         score, self._shown = score_views(self.field, self._scored_views, self._scorer)
         self.spent_s += slice_s
-        # After Ctrl-C there is no report, but our fields count their steps themselves.
-        steps = report.steps if report else max(getattr(self.field, "step", 0) - began_at, 0)
+        # After Ctrl-C there is no report, but most fields count their steps, from 0 again where they begin anew.
+        after = getattr(self.field, "step", 0)
+        steps = report.steps if report else after - began_at if after >= began_at else after
         self.spent_steps += steps
         self._processes.append(usage | {"t_s": round(self.spent_s, 3)})
         self.outside = outside_cores(usage)

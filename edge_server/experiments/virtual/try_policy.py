@@ -80,7 +80,8 @@ def try_policy(
         opened = with_policy(opened, policy)
     deployment, _ = open_simulation(opened, folders_from(), usual_settings)
     if not isinstance(policy, str):
-        policy.name = getattr(policy, "name", type(policy).__name__)
+        if not hasattr(policy, "name"):
+            policy.name = type(policy).__name__
         deployment.updates.policy = policy
     deployment.run(seconds)
     name = deployment.updates.policy.name

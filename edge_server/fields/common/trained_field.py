@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from edge_server.fields import Correction, View
+from edge_server.fields import View
 from edge_server.fields import field_constants as tuned
 from edge_server.fields.common.cameras.camera_refinement import CameraRefinement
 from edge_server.fields.common.field_state import load_arrays
@@ -77,12 +77,11 @@ class TrainedField(SteppedField[RaySnapshot]):
 
         return one_step
 
-    def correction(self, view: View) -> Correction | None:
-        """See ``fields.RefinesCameras``: the pose alone, of a view that it learns from. Appearances are learned apart,
-        and no other camera's error tells that of a view that is held out."""
+    def learned_pose(self, view: View) -> NDArray[np.float64] | None:
+        """The pose (4, 4) that a view which it learns from was corrected to; None: it was not. No other camera's error
+        tells that of a view that is held out, so that this is no ``fields.RefinesCameras``."""
         poses = self._cameras.poses
-        learned = None if poses is None else poses.learned_pose(view)
-        return None if learned is None else Correction(learned, np.ones(3), np.zeros(3))
+        return None if poses is None else poses.learned_pose(view)
 
     def _live(self) -> RaySnapshot:
         return RaySnapshot(

@@ -95,7 +95,7 @@ def test_resuming_continues_bit_for_bit(name: str, monkeypatch: pytest.MonkeyPat
         np.testing.assert_array_equal(origin, box.normalise(learned))
         exported = np.stack([ViewedField(name, b, b.views).pose(view)[:3, 3] for view in made.SEEN])
         np.testing.assert_array_equal(exported, learned)
-        assert a.correction(made.HELD) is None, "its error is not known"
+        assert a.learned_pose(made.HELD) is None, "its error is not known"
         assert any(np.abs(shift).max() > 0 for _, shift, *_ in a._cameras.meta()["poses"].values())
 
 

@@ -75,7 +75,8 @@ def pixel_direction(lens, rotation, u, v):
             dx = 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
             dy = p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
             x, y = (x0 - dx) / radial, (y0 - dy) / radial
-        for _ in range(2):  # of Newton's steps, see Pinhole
+        best, kept_x, kept_y = 1e30, x, y
+        for _ in range(3):  # two of Newton's steps, where they lead nearer, see Pinhole
             r2 = x * x + y * y
             radial, slope = 1.0 + r2 * (k1 + r2 * k2), 2.0 * (k1 + 2.0 * r2 * k2)
             xx = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
@@ -84,7 +85,13 @@ def pixel_direction(lens, rotation, u, v):
             ex = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - x0
             ey = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - y0
             determinant = xx * yy - xy * xy
+            if not ex * ex + ey * ey < best:
+                break
+            best, kept_x, kept_y = ex * ex + ey * ey, x, y
+            if determinant == 0.0:
+                break
             x, y = x - (yy * ex - xy * ey) / determinant, y - (xx * ey - xy * ex) / determinant
+        x, y = kept_x, kept_y
     scale = 1.0 / np.sqrt(x * x + y * y + 1.0)
     x, y, z = x * scale, y * scale, scale
     return (

@@ -371,7 +371,7 @@ class CarriedField(ScanField):
     def _pixels_of(self, view: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         one = self._views[view]
         weight = np.zeros((0, 0), np.float32) if one.weight is None else one.weight
-        return np.ascontiguousarray(one.image), weight
+        return np.ascontiguousarray(one.image), np.ascontiguousarray(weight)
 
     def _most(self) -> int:
         return min(super()._most(), max(int(tuned.PER_PIXEL * self._pixels), tuned.LEAST))
