@@ -78,6 +78,10 @@ class ViewStore:
         """Keep the scene's box, whatever cameras come."""
         self._box_cameras = tuned.FINAL_BOX_CAMERAS
 
+    def forget_scene(self) -> None:
+        """Find the scene's box and its background anew, from the views that come next."""
+        self.box, self._box_cameras, self._packed = None, 0, None
+
     def forget_views(self) -> None:
         """Forget the views; box and background stay."""
         self.memory, self._packed = {}, None

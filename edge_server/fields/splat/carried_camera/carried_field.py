@@ -22,7 +22,7 @@ from edge_server.fields.splat.carried_camera import keyframe_choice
 from edge_server.fields.splat.carried_camera.frame_stereo import sweep_depth
 from edge_server.fields.splat.carried_camera.plausibility import agreeing, flat, moved_in, troubles, unturned
 from edge_server.fields.splat.carried_camera.pose_alignment import Alignment, Rendered, align, gray
-from edge_server.fields.splat.carried_camera.reported_poses import OwnMotion, search
+from edge_server.fields.splat.carried_camera.reported_poses import OwnMotion, guessed_poses, search
 from edge_server.fields.splat.carried_camera.scan_field import ScanField, Shown, aim_of
 from edge_server.fields.splat.carried_camera.seeds_on_depth import usable_depth
 from edge_server.fields.splat.densification import opacity
@@ -59,6 +59,7 @@ class CarriedField(ScanField):
             check_view(view)
         news = [view for view in views if self._is_new(view)]
         if news and (not self._views or (self._bare and not all(_is_bare(view) for view in news))):
+            self.view_store.forget_scene()
             self._begin(news)
         due = self._due_before + keyframe_choice.due(self.step, len(self._seen), self._taken)
         best = {}
@@ -208,8 +209,8 @@ class CarriedField(ScanField):
         if after_leap is not None:
             known = self._poses.known[view.camera]
             self._poses.begin(after_leap, camera)
-            fits = not tracked.fits and self._track(after_leap, tuned.GUESSED_ERROR).fits
-            if self._own.try_leap(camera, fits):
+            fits = not tracked.fits and self._fits_after_leap(after_leap)
+            if self._own.try_leap(camera, tracked.fits, fits):
                 return after_leap
             if fits:
                 return None
@@ -224,7 +225,7 @@ class CarriedField(ScanField):
                 if reports.astray:
                     return self._own.located(view, camera, *found)
                 if not tracked.fits:
-                    again = self._search(view, tuned.FOLLOWED) or found
+                    again = self._search(view, goes_on=tuned.FOLLOWED) or found
                     leapt = self._own.suggest_leap(view, camera, begun, again[0])
             elif found is not None and not unseen:
                 reports.trust()
@@ -232,14 +233,28 @@ class CarriedField(ScanField):
             return None
         return view if self._plausible(view, tracked, leapt) else None
 
+    def _fits_after_leap(self, view: View) -> bool:
+        """Whether a view fits where a leap leads: to the field, or to the keyframe before, since a camera that went on
+        sees what no keyframe has shown the field yet."""
+        there = self._track(view, tuned.GUESSED_ERROR)
+        if there.fits:
+            return True
+        found = self._search(view, [there.pose])
+        if found is None or not self._poses.within(there.pose, found[0], 1.0):
+            return False
+        self._poses.set_pose(view, found[0])
+        return True
+
     def _has_depth_of(self, view: View) -> View | None:
         """The newest keyframe with depth of a view's camera, if it was taken not long before."""
         last, before = self._depths.get(_carrier(view)), self._own.before(view, _carrier(view))
         recent = last is not None and bool(before) and last.generated_ns >= before[0].at_ns
         return last if recent else None
 
-    def _search(self, view: View, goes_on: float = 0.0) -> tuple[NDArray[np.float64], float] | None:
-        """See ``reported_poses.search``."""
+    def _search(
+        self, view: View, guesses: Sequence[NDArray[np.float64]] = (), goes_on: float = 0.0
+    ) -> tuple[NDArray[np.float64], float] | None:
+        """See ``reported_poses.search``. guesses: none: see ``guessed_poses``."""
         last, before = self._has_depth_of(view), self._own.before(view, _carrier(view))
         if last is not None and (z := last.depth) is not None:
             kept = Rendered(self._pose_of(last), last.intrinsics, gray(last.image), z, np.ones_like(z))
@@ -247,7 +262,8 @@ class CarriedField(ScanField):
             kept = self._rendered(newest[-1], self._pose_of(newest[-1]))._replace(gray=gray(newest[-1].image))
         else:
             return None
-        return search(view, kept, before, self._poses, lambda pose: self._rendered(view, pose), goes_on)
+        guesses = guesses or guessed_poses(view, before)
+        return search(view, kept, before, guesses, self._poses, lambda pose: self._rendered(view, pose), goes_on)
 
     def _rendered(self, view: View, pose: NDArray[np.float64]) -> Rendered:
         shown, lens = self._look(view, tuned.RENDERED_HALVINGS, pose), view.intrinsics.halved(tuned.RENDERED_HALVINGS)

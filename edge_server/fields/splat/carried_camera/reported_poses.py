@@ -142,11 +142,15 @@ class OwnMotion:
             return None
         return replace(view, camera_to_world=leap.back @ self._as_reported(view, camera))
 
-    def try_leap(self, camera: str, fits: bool) -> bool:
-        """Note whether a view fits to the leap that is suggested. Returns whether so many did that it is believed."""
+    def try_leap(self, camera: str, as_reported: bool, fits: bool) -> bool:
+        """Note whether a view fits as reported, or to the leap that is suggested; one that fits neither says nothing of
+        it. Returns whether so many fit to the leap that it is believed."""
         known = self.of(camera)
-        leap, known.tried = known.suggested, known.tried + 1
-        if leap is None or (fits and known.tried < tuned.LEAPT):
+        leap = known.suggested
+        if leap is None or not (as_reported or fits):
+            return False
+        known.tried += 1
+        if fits and known.tried < tuned.LEAPT:
             return False
         known.suggested = None
         if fits:
@@ -218,19 +222,20 @@ def search(
     view: View,
     kept: Rendered,
     before: Sequence[PoseCorrection],
+    guesses: Sequence[Array],
     poses: PoseCorrections,
     rendered: Callable[[Array], Rendered],
     goes_on: float = 0.0,
 ) -> tuple[Array, float] | None:
     """Where a view was taken, (4, 4), by an earlier view and then the field, and ``followed_scale``; None: not found.
 
-    kept: the earlier view, with its depth. before: see ``guessed_poses``. poses: says how far apart poses may be.
-    rendered: renders the field from a pose. goes_on: see ``align_from``.
+    kept: the earlier view, with its depth. before: see ``guessed_poses``. guesses: (4, 4) each, to begin with.
+    poses: says how far apart poses may be. rendered: renders the field from a pose. goes_on: see ``align_from``.
     """
     frame = gray(view.image)
     if frame.std() < tuned.FLAT * kept.gray.std():
         return None  # an exposure could be found by which it agrees
-    found = align_from(kept, frame, guessed_poses(view, before), goes_on)
+    found = align_from(kept, frame, guesses, goes_on)
     least = tuned.LEAST_OVERLAP * float((kept.depth > 0).mean())
     if found.overlap < least or found.agreeing < tuned.LOCATED:
         return None
