@@ -10,7 +10,7 @@ from camera_node.doctor import doctor_constants as tuned
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes, mount_on_flange
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.settings import ArmConfig, PathConfig
-from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
+from camera_node.robot.arm.tour_planning import plan_tour, viewpoints
 from freshfield.clock import WallClock
 from freshfield.scenario import Scenario
 

@@ -15,7 +15,7 @@ import numpy as np
 from camera_node.synthetic import motion
 from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.placement import MovingBody, Part
-from camera_node.synthetic.settings import MAX_SPEED_M_PER_S
+from camera_node.synthetic.scene_parameters import MAX_SPEED_M_PER_S
 from camera_node.synthetic.shapes import RoundCone, Shape, Sphere
 from camera_node.synthetic.textures import Bands, Plaid, Plain, Spots, Stripes, Texture
 from freshfield.geometry import Array

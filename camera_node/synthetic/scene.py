@@ -13,7 +13,7 @@ from typing import Any
 
 from camera_node.synthetic.camera_rig import PosedCameras
 from camera_node.synthetic.render import CameraRenderer, Image, World
-from camera_node.synthetic.settings import MAX_CAMERAS, BaseParams
+from camera_node.synthetic.scene_parameters import MAX_CAMERAS, BaseParams
 from freshfield.geometry import Array, Pinhole
 from freshfield.settings import ScenarioError, as_mapping, read_settings
 

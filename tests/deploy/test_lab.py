@@ -8,7 +8,7 @@ import subprocess
 import pytest
 
 from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand_eyes
-from camera_node.robot.arm.viewpoint_tour import plan_tour, viewpoints
+from camera_node.robot.arm.tour_planning import plan_tour, viewpoints
 from camera_node.settings import source_config
 from freshfield.scenario import load
 from freshfield_up.scenario_command import checked

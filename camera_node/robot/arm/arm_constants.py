@@ -25,7 +25,7 @@ STALLED_S, STALLED_RAD = 5.0, 1e-3
 # Largest turn of a joint by hand that is tolerated between what was shown to the operator and the answer.
 MOVED_RAD = 0.01
 
-# --- tours of viewpoints (viewpoint_tour, drive_arm_command, kinematics) ---
+# --- tours of viewpoints (tour_planning, drive_arm_command, kinematics) ---
 FARTHEST_RAD = 2.0  # largest turn of a joint in one move
 CHECKED_POSTURES = 24  # along a path, ends included, that have to be free
 LEAST_VIEWPOINTS = 3  # that a tour has to reach

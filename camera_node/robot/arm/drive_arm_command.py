@@ -30,7 +30,7 @@ from camera_node.robot.arm.control import (
 )
 from camera_node.robot.arm.joint_states import ArmStream
 from camera_node.robot.arm.settings import PathConfig
-from camera_node.robot.arm.viewpoint_tour import Tour, plan_tour
+from camera_node.robot.arm.tour_planning import Tour, plan_tour
 from camera_node.settings import errors_of
 from freshfield.scenario import ScenarioError, load
 

@@ -20,8 +20,8 @@ from camera_node.synthetic.person import make_walk, walking_person
 from camera_node.synthetic.placement import Part, at
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import Scene, pinhole
+from camera_node.synthetic.scene_parameters import MAX_CAMERAS, MovingParams
 from camera_node.synthetic.scenes.shell import room_shell
-from camera_node.synthetic.settings import MAX_CAMERAS, MovingParams
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Shape, Sphere
 from freshfield.geometry import Array
 from freshfield.settings import within

@@ -18,7 +18,7 @@ from camera_node.synthetic.motion import PERIOD_UNIT_S
 from camera_node.synthetic.placement import Part, at, facing
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import Scene, pinhole
-from camera_node.synthetic.settings import BaseParams, Fov
+from camera_node.synthetic.scene_parameters import BaseParams, Fov
 from camera_node.synthetic.shapes import Box, Cylinder, Quad, Sphere
 from freshfield.geometry import Array
 

@@ -17,8 +17,8 @@ from camera_node.synthetic.person import Walk, make_walk, walking_person
 from camera_node.synthetic.placement import MovingBody, Part, at, facing
 from camera_node.synthetic.render import World
 from camera_node.synthetic.scene import Scene, pinhole
+from camera_node.synthetic.scene_parameters import Fov, MovingParams
 from camera_node.synthetic.scenes.shell import room_shell
-from camera_node.synthetic.settings import Fov, MovingParams
 from camera_node.synthetic.shapes import Box, Cylinder, RoundCone, Sphere
 from freshfield.geometry import Array
 

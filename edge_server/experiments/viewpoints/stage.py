@@ -126,7 +126,7 @@ def _world(scenario: Scenario, source: WorldConfig, count: int, size: int | None
 
 def _arm_reaches(scenario: Scenario, source: SourceConfig, candidates: Candidates) -> NDArray[np.bool_]:
     from camera_node.robot.arm.camera_poses import arm_model, base_matrix, mount_on_flange
-    from camera_node.robot.arm.viewpoint_tour import reachable
+    from camera_node.robot.arm.tour_planning import reachable
 
     arm = source.arm  # type: ignore[attr-defined]
     mount = mount_on_flange(scenario, arm)

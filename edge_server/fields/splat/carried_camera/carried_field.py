@@ -62,13 +62,7 @@ class CarriedField(ScanField):
             self.view_store.forget_scene()
             self._begin(news)
         due = self._due_before + keyframe_choice.due(self.step, len(self._seen), self._taken)
-        best = {}
-        for view in sorted(news, key=lambda view: (view.depth is not None, view.generated_ns)):
-            best[view.camera] = view  # the newest, of those with depth if there are any: only they seed
-        first = [view for view in best.values() if view.camera not in self._seen]
-        waiting = [view for view in best.values() if view.camera in self._seen]
-        waiting.sort(key=lambda view: self._seen[view.camera].generated_ns)
-        for view in [*first, *waiting[: max(due, 0)]]:
+        for view in keyframe_choice.next_keyframes(news, self._seen, due):
             self._take(view)
         self._snapshot = None
 

@@ -1,12 +1,13 @@
-"""Which keyframes of a carried camera stay, and which one a step learns from."""
+"""Which views of a carried camera become keyframes, which ones stay, and which one a step learns from."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.fields import View
 from edge_server.fields.splat.carried_camera import carried_camera_constants as tuned
 
 
@@ -14,6 +15,21 @@ def due(steps: int, cameras: int, taken: int) -> int:
     """How many more keyframes may be taken: the first of each of ``cameras``, then one in so many steps, less those
     that were ``taken``."""
     return steps // tuned.STEPS_A_KEYFRAME + cameras - taken
+
+
+def next_keyframes(views: Sequence[View], seen: Mapping[str, View], most: int) -> list[View]:
+    """The views that become keyframes: of each camera the newest, of those with depth if there are any, as only they
+    seed. All of cameras that have none yet, and of the others at most ``most``, longest without one first.
+
+    seen: the last view of each camera that became a keyframe.
+    """
+    best = {}
+    for view in sorted(views, key=lambda view: (view.depth is not None, view.generated_ns)):
+        best[view.camera] = view
+    first = [view for view in best.values() if view.camera not in seen]
+    waiting = [view for view in best.values() if view.camera in seen]
+    waiting.sort(key=lambda view: seen[view.camera].generated_ns)
+    return [*first, *waiting[: max(most, 0)]]
 
 
 def most_kept(pixels: int) -> int:

@@ -19,7 +19,7 @@ from camera_node.robot.arm.camera_poses import arm_model, base_matrix, load_hand
 from camera_node.robot.arm.control import stop_event
 from camera_node.robot.arm.joint_states import ArmStream, FlangePoses
 from camera_node.robot.arm.kinematics import UR3E
-from camera_node.robot.arm.viewpoint_tour import plan_tour
+from camera_node.robot.arm.tour_planning import plan_tour
 from camera_node.robot.flange_camera import TruthClient
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.settings import source_config

@@ -18,7 +18,7 @@ from camera_node.robot.arm.capsules import PAIRS, CapsuleModel, segment_distance
 from camera_node.robot.arm.hand_eye_mount import MountedCameraPoses, read_hand_eye
 from camera_node.robot.arm.kinematics import UR3E, apply_calibration
 from camera_node.robot.arm.settings import PathConfig
-from camera_node.robot.arm.viewpoint_tour import is_free, plan_tour, reachable, viewpoints
+from camera_node.robot.arm.tour_planning import is_free, plan_tour, reachable, viewpoints
 from camera_node.robot.simulated_controller.controller import HOME_RAD
 from camera_node.settings import source_config
 from freshfield.geometry import Pose, se3, so3_exp
