@@ -1,9 +1,9 @@
 """Four cameras with depth in scenes and rigs that deceive sensors: what depth must still be worth there.
 
-A ball moves on a plate. Each case is compared with the same images without depth, or with the easy scene, and says
-after how many seconds of virtual time the picture has recovered. Training amplifies rounding, and processors round
-differently: a single training says little, so each figure is a mean of three, and each bound lies three standard errors
-of such a mean beside that of eight.
+A ball moves on a plate. Each case is compared with the same images without depth, or with the easy scene, at the end;
+and over all frames, where a picture that comes late is worse. Training amplifies rounding,
+and processors round differently: a single training says little, so each figure is a mean of three, and each bound lies
+three standard errors of such a mean beside that of eight or more.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from edge_server.fields import View
 from edge_server.fields.splat.layers.layered_field import LayeredField
 from freshfield.geometry import world_rays
 from tests.edge_server.fields.scenes import ring, seen
-from tests.edge_server.fields.splat.layers.ball import FRAME_S, SMALL, Change, Rig, ball_alone, measured
+from tests.edge_server.fields.splat.layers.ball import SMALL, Change, Rig, ball_alone, measured
 
 pytestmark = [pytest.mark.stability, pytest.mark.usefixtures("shown_soon")]
 FOUR, FRAMES = (0, 2, 4, 6), 36
@@ -72,10 +72,10 @@ def _turned(view: View, degrees: float) -> View:
 class Case:
     """world: see ``Rig``. placed: where the cameras really stand. told: what reaches the field of camera k's frame.
     gains_db: how much better than without depth the held-out view must be; None: not compared. below_easy_db: how much
-    worse than in the easy scene it may be; both in the last half second. recovers_s: at most, see ``_recovered_s``;
-    since the first frame, or since frame ``over``."""
+    worse than in the easy scene it may be; both in the last half second. mean_db: least mean of all frames, or of those
+    from ``over`` on."""
 
-    recovers_s: float
+    mean_db: float
 
     world: Callable[[View, Array], View] = ball_alone
     placed: Callable[[int, View], View] = lambda k, view: view
@@ -107,24 +107,24 @@ def _near(k: int, frame: int, view: View) -> View:
 
 
 CASES = {
-    "mirror": Case(0.5, _mirror, gains_db=0.7),
-    "glass": Case(0.9, _glass, gains_db=1.1),
-    "two thirds out of range": Case(1.5, told=_near, gains_db=0.9),
+    "mirror": Case(14.8, _mirror, gains_db=0.7),
+    "glass": Case(19.0, _glass, gains_db=1.1),
+    "two thirds out of range": Case(19.2, told=_near, gains_db=0.9),
     "scale 5 % off": Case(
-        1.1, told=_of_first(lambda v: replace(v, depth=v.depth * np.float32(1.05))), below_easy_db=0.9
+        18.5, told=_of_first(lambda v: replace(v, depth=v.depth * np.float32(1.05))), below_easy_db=0.9
     ),
-    "pose 3 degrees off": Case(0.7, told=_of_first(lambda v: _turned(v, 3.0)), gains_db=-0.1),
-    "two at one place": Case(0.6, placed=lambda k, view: ring(9)[2] if k == 0 else view, gains_db=2.5),
-    "nothing in common": Case(0.3, placed=lambda k, view: _turned(view, (-24.0, 24.0, -24.0, 24.0)[k]), gains_db=1.1),
+    "pose 3 degrees off": Case(17.8, told=_of_first(lambda v: _turned(v, 3.0)), gains_db=-0.1),
+    "two at one place": Case(17.7, placed=lambda k, view: ring(9)[2] if k == 0 else view, gains_db=2.5),
+    "nothing in common": Case(14.2, placed=lambda k, view: _turned(view, (-24.0, 24.0, -24.0, 24.0)[k]), gains_db=1.1),
     "light off": Case(
-        0.3,
+        17.9,
         told=lambda k, frame, v: replace(v, image=v.image // 40) if frame in DARK else v,
         below_easy_db=0.2,
         over=DARK.stop,
     ),
-    "ten kilometers away": Case(1.5, told=_in_world(1.0, 1e4), below_easy_db=0.5),
-    "a third as large": Case(0.9, told=_in_world(1.0 / 3.0, 0.0), below_easy_db=1.5),
-    "twice as large": Case(0.9, told=_in_world(2.0, 0.0), below_easy_db=0.7),
+    "ten kilometers away": Case(18.6, told=_in_world(1.0, 1e4), below_easy_db=0.5),
+    "a third as large": Case(18.2, told=_in_world(1.0 / 3.0, 0.0), below_easy_db=1.5),
+    "twice as large": Case(18.9, told=_in_world(2.0, 0.0), below_easy_db=0.7),
 }
 
 
@@ -148,13 +148,6 @@ def _easy_db() -> float:
     return _end_db(_curves(Case(0.0)))
 
 
-def _recovered_s(curve: Array, over: int) -> float:
-    """Seconds after frame ``over`` from which on each half second's mean is within 1 dB of the last one's."""
-    means = np.convolve(curve, np.full(HALF_SECOND, 1.0 / HALF_SECOND), "valid")
-    below = np.flatnonzero(means < means[-1] - 1.0)
-    return max(int(below[-1]) + 1 - over if len(below) else 0, 0) * FRAME_S
-
-
 # Of the others each rule is held by itself: what contradicts in ``test_surfaces``, poses and scales in
 # ``test_stereo_and_registration``.
 @pytest.mark.parametrize("name", [pytest.param(c, marks=[pytest.mark.slow] * (c != "mirror")) for c in CASES])
@@ -165,4 +158,4 @@ def test_depth_is_worth_something_where_sensors_are_deceived(name: str) -> None:
         assert _end_db(curves) > _end_db(_curves(case, depth=False)) + case.gains_db
     if case.below_easy_db is not None:
         assert _end_db(curves) > _easy_db() - case.below_easy_db
-    assert np.mean([_recovered_s(curve, case.over) for curve in curves]) <= case.recovers_s
+    assert curves[:, case.over :].mean() > case.mean_db
