@@ -114,7 +114,7 @@ def test_the_wheel_carries_scenarios_and_models_and_its_launcher_runs_one_by_nam
     words = ["demo", "quad", "--for", "5s", "--out", "runs/up", "--port", str(free_port())]
     command = [str(programs / "freshfield"), *words]
     there = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "MYPYPATH")}
-    done = subprocess.run(command, cwd=tmp_path, env=there, capture_output=True, text=True, timeout=120)
+    done = subprocess.run(command, cwd=tmp_path, env=there, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     report = json.loads((tmp_path / "runs/up/report.json").read_text())
     assert report["frames"]["closes"] and report["frames"]["delivered"] > 0

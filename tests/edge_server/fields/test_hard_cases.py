@@ -317,6 +317,7 @@ def test_density_that_overflows_stays_finite(kind: str, value: float) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)  # compiles all kernels: four minutes where cores are slow and shared
 def test_bounds_are_kept_in_every_kernel(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     """Whole fits and renderings with numba's bounds checks, which need a process and kernels of their own."""
     cached = getattr(request.config, "cache", None)

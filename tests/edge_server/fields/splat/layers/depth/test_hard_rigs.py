@@ -1,9 +1,9 @@
 """Four cameras with depth in scenes and rigs that deceive sensors: what depth must still be worth there.
 
 A ball moves on a plate. Each case is compared with the same images without depth, or with the easy scene, at the end;
-and over all frames, where a picture that comes late is worse. Training amplifies rounding,
-and processors round differently: a single training says little, so each figure is a mean of three, and each bound lies
-three standard errors of such a mean beside that of eight or more.
+and over all frames, where a picture that comes late is worse. Training amplifies rounding, and processors round
+differently: a single training says little, so each figure is a mean of three, and each bound lies three standard errors
+of such a mean beside that of eight or more.
 """
 
 from collections.abc import Callable
