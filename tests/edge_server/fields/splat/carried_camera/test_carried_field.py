@@ -167,22 +167,23 @@ def _at_a_wall(k: int, view: View) -> View:
     return replace(_white(view), camera_to_world=pose)
 
 
-# With depth and without, in dB.
-MOST_LOST = {_looks_about: (1.0, 1.0), _at_a_wall: (1.0, 1.0), _under_a_hand: (0.5, 1.0)}
+# On average over four instants, with depth and without, in dB; at a single one 1 dB more.
+MOST_LOST = {_looks_about: (1.0, 0.5), _at_a_wall: (0.3, 0.8), _under_a_hand: (0.3, 0.8)}
 
 
 @pytest.mark.slow  # 20 s each
 @pytest.mark.stability
 @pytest.mark.parametrize(("begin", "depth"), [*product(MOST_LOST, (True, False))])
 def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool) -> None:
-    """Lost at most, against a walk without that beginning, at each of four instants, on average over three trainings.
-    What a camera that only turns, or sees nothing, guesses of the scene cost up to 11 dB for as long as it was kept."""
+    """Lost at most, against a walk without that beginning, on average over three trainings. What a camera that only
+    turns, or sees nothing, guesses of the scene cost up to 11 dB for as long as it was kept."""
     clean, lost = walk(depth=depth)[:50], []
     views = [replace(view, generated_ns=view.generated_ns + 2_000_000_000) for view in clean]
     for seed in carried.SEEDS:
         found_db = carried.by_seconds(views, views, given(carried_field(seed=seed), _beginning(begin, clean[0])))
         lost.append(np.array(carried.undisturbed(depth, seed))[:4] - found_db)
-    assert np.mean(lost, axis=0).max() < MOST_LOST[begin][not depth]
+    mean_db, most_db = np.mean(lost, axis=0), MOST_LOST[begin][not depth]
+    assert mean_db.mean() < most_db and mean_db.max() < most_db + 1.0
 
 
 @pytest.mark.stability
