@@ -145,6 +145,11 @@ class LayeredField:
         return ""
 
     @property
+    def step(self) -> int:
+        """Optimizer steps of the still field so far."""
+        return self.still.step
+
+    @property
     def views(self) -> tuple[View, ...]:
         """What the still field learns from: a view of each camera, or its background plate."""
         return tuple(view for view in self.still.views if not self.cameras or view.camera in self.cameras)

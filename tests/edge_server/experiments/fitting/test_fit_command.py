@@ -53,7 +53,8 @@ def test_it_learns_goes_on_and_leaves_report_pictures_and_checkpoint(tmp_path, c
     assert "has learned" in (said := capsys.readouterr().err) and "give the --holdout that it began with" in said
 
 
-def test_ctrl_c_amid_a_slice_keeps_its_steps(tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("words", [SMALL_WORDS, ["--field", "splat", "--option", "layers=true"]])
+def test_ctrl_c_amid_a_slice_keeps_its_steps(tmp_path, capsys, monkeypatch, words):
     def end_third(budget, end=StepBudget.end_step):
         end(budget)
         if budget.steps == 3:
@@ -61,7 +62,7 @@ def test_ctrl_c_amid_a_slice_keeps_its_steps(tmp_path, capsys, monkeypatch):
 
     write_photos(tmp_path / "set", 5)
     monkeypatch.setattr(StepBudget, "end_step", end_third)
-    assert fit(tmp_path / "set", tmp_path / "out", "--seconds", "5") == 0
+    assert edge_server(["fit", str(tmp_path / "set"), "--out", str(tmp_path / "out"), *words, "--seconds", "5"]) == 0
     assert "stopped early" in (said := capsys.readouterr().out) and "3 steps" in said
     assert checkpoint.load(tmp_path / "out" / "field")[1]["steps"] == 3
 
