@@ -15,7 +15,7 @@ import numpy as np
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments import experiment_constants as tuned
-from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, folders_of
+from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, check_seconds, folders_of
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
@@ -23,7 +23,6 @@ from edge_server.experiments.common.statistics import discoveries, interval, pai
 from edge_server.experiments.engine import Engine, EngineError
 from edge_server.experiments.rollouts.rollout import run_rollouts
 from edge_server.experiments.rollouts.setting import Setting, seeds
-from edge_server.experiments.virtual.simulate_command import check_seconds
 from edge_server.machine import commit, machine
 from edge_server.scheduler import STATE_PARTS, make_policy, parse_policy, short_name
 from edge_server.settings import read_config

@@ -56,6 +56,12 @@ def at_least(least: int) -> Callable[[str], int]:
     return read
 
 
+def check_seconds(seconds: float) -> None:
+    """OptionError for a time that no run or fit can take."""
+    if not 0.0 < seconds <= 1e6:
+        raise OptionError(f"--seconds {seconds:g}: expected more than 0 and at most 1e6")
+
+
 def parse_options(words: Sequence[str]) -> dict[str, Any]:
     """Parse words ``KEY=VALUE`` to options of a field; values are YAML (8, 0.5, true, [0, 0, 1], white).
     Raises OptionError."""

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.experiments import experiment_constants as tuned
-from edge_server.experiments.common.arguments import OptionError
+from edge_server.experiments.common.arguments import OptionError, check_seconds
 from edge_server.experiments.fitting.misfits import misfits
 from edge_server.experiments.scenes.multiview_still import mean_baselines, open_still, score_views
 from edge_server.experiments.scenes.recorded import MultiviewStill
@@ -308,12 +308,6 @@ def marks_s(total_s: float) -> list[float]:
     later = np.arange(tuned.FIT_MARKS_S[-1] + tuned.FIT_THEN_EVERY_S, total_s, tuned.FIT_THEN_EVERY_S)
     before_s = (1.0 - tuned.FIT_LAST_SHARE) * total_s
     return [m for m in (*tuned.FIT_MARKS_S, *map(float, later)) if m <= before_s] + [total_s]
-
-
-def check_seconds(seconds: float) -> None:
-    """OptionError for a time that no fit can take."""
-    if not 0.0 < seconds <= 1e6:
-        raise OptionError(f"--seconds {seconds:g}: expected more than 0 and at most 1e6")
 
 
 def _read_lines(path: Path) -> list[dict[str, Any]]:

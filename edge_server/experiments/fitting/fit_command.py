@@ -11,9 +11,9 @@ from typing import Any
 from camera_node.sources.datasets.formats import FORMATS
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
-from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, parse_options
+from edge_server.experiments.common.arguments import OptionError, add_lpips, at_least, check_seconds, parse_options
 from edge_server.experiments.fitting import ctrl_c
-from edge_server.experiments.fitting.fit import Fit, check_seconds
+from edge_server.experiments.fitting.fit import Fit
 from edge_server.experiments.scenes.multiview_still import data_name, open_still
 from edge_server.experiments.scenes.recorded import MultiviewStill
 from edge_server.fields.registry import FIELD, field_names

@@ -21,10 +21,9 @@ from scipy.optimize import nnls
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments import experiment_constants as tuned
-from edge_server.experiments.common.arguments import add_folders, folders_of
+from edge_server.experiments.common.arguments import add_folders, check_seconds, folders_of
 from edge_server.experiments.virtual.from_scenario import build_deployment
 from edge_server.experiments.virtual.run_settings import RunSettings
-from edge_server.experiments.virtual.simulate_command import check_seconds
 from edge_server.machine import machine, versions
 from edge_server.settings import ComputeConfig, EdgeConfig, read_config
 from freshfield.files import out_file, write_json

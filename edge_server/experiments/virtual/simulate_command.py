@@ -19,7 +19,7 @@ from msgspec.structs import asdict
 from camera_node.capture import build_cameras
 from camera_node.settings import source_config
 from edge_server.command import command_parser, exit_status
-from edge_server.experiments.common.arguments import add_folders, at_least, folders_of
+from edge_server.experiments.common.arguments import add_folders, at_least, check_seconds, folders_of
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.tables import mean_or_none, number
 from edge_server.experiments.engine import processor
@@ -300,12 +300,6 @@ def _scenario(args: argparse.Namespace) -> Scenario:
         args.out.mkdir(parents=True, exist_ok=True)  # before the work, not after it
     check_seconds(args.seconds)
     return dataclasses.replace(scenario, edge=edge)
-
-
-def check_seconds(seconds: float) -> None:
-    """ScenarioError for a time that no run can take."""
-    if not 0.0 < seconds <= 1e6:
-        raise ScenarioError(f"--seconds: expected more than 0 and at most 1e6, got {seconds:g}")
 
 
 def usual_settings(config: EdgeConfig) -> RunSettings:

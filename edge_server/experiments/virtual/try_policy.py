@@ -9,14 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edge_server.experiments.common.arguments import check_seconds
 from edge_server.experiments.common.folders import folders_from
-from edge_server.experiments.virtual.simulate_command import (
-    check_seconds,
-    open_simulation,
-    summary,
-    usual_settings,
-    with_policy,
-)
+from edge_server.experiments.virtual.simulate_command import open_simulation, summary, usual_settings, with_policy
 from edge_server.fidelity.scorer import Score
 from edge_server.live.state import Publication
 from edge_server.scheduler import Policy
@@ -72,7 +67,7 @@ def try_policy(
         ``freshfield.Policy``.
     scenario: a file, or the name of a shipped one; with a held-out camera there are scores.
     seconds: of virtual time. seed: in place of the scenario's.
-    Raises ScenarioError or DatasetError.
+    Raises OptionError, ScenarioError or DatasetError.
     """
     check_seconds(seconds)
     opened = load(str(scenario), seed)

@@ -24,8 +24,8 @@ from tests.support import refusal, refused
     [
         ("compare SMALL hope", "hope"),
         ("compare SMALL all --channel sms", "sms"),
-        ("compare SMALL all --seconds inf", "--seconds: expected more than 0"),
-        ("costs SMALL --seconds nan", "--seconds: expected more than 0"),
+        ("compare SMALL all --seconds inf", "--seconds inf: expected more than 0"),
+        ("costs SMALL --seconds nan", "--seconds nan: expected more than 0"),
         ("compare nowhere all", "shipped scenarios"),
         ("fit SET --option levels", "expected KEY=VALUE"),
         ("fit SET --resume", "no fit to go on from"),
