@@ -15,7 +15,14 @@ import numpy as np
 from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments import experiment_constants as tuned
-from edge_server.experiments.common.arguments import add_folders, add_workers, at_least, check_seconds, folders_of
+from edge_server.experiments.common.arguments import (
+    OptionError,
+    add_folders,
+    add_workers,
+    at_least,
+    check_seconds,
+    folders_of,
+)
 from edge_server.experiments.common.channels import read_channel
 from edge_server.experiments.common.folders import Folders
 from edge_server.experiments.common.seed_table import SeedTable
@@ -92,6 +99,8 @@ def setting_of(scenario: Scenario, seconds: float, channel: str | None = None) -
     seconds: scored, after the lead. channel: as in ``read_channel``. Raises ScenarioError or ValueError.
     """
     check_seconds(seconds)
+    if seconds * 1e3 < tuned.INSTANT_GRID_MS:
+        raise OptionError(f"--seconds {seconds:g}: expected at least {tuned.INSTANT_GRID_MS / 1e3:g}")
     scenario = dataclasses.replace(scenario, edge={**scenario.edge, "policy": {"name": "all"}})
     if channel is not None:
         scenario = dataclasses.replace(scenario, channel=read_channel(channel)[0])

@@ -25,6 +25,7 @@ from tests.support import refusal, refused
         ("compare SMALL hope", "hope"),
         ("compare SMALL all --channel sms", "sms"),
         ("compare SMALL all --seconds inf", "--seconds inf: expected more than 0"),
+        ("compare SMALL all --seconds 0.005", "--seconds 0.005: expected at least 0.01"),
         ("costs SMALL --seconds nan", "--seconds nan: expected more than 0"),
         ("compare nowhere all", "shipped scenarios"),
         ("fit SET --option levels", "expected KEY=VALUE"),
