@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from functools import partial
 
 from camera_node.sources.datasets.records import DatasetError
+from camera_node.synthetic.scene_parameters import BaseParams
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments import experiment_constants as tuned
 from edge_server.experiments.common.arguments import add_folders, add_workers, folders_of
@@ -24,6 +25,7 @@ from edge_server.scheduler.learned.rewards import REWARDS
 from edge_server.settings import read_config
 from freshfield.files import out_folder, write_csv
 from freshfield.scenario import Scenario, ScenarioError, load
+from freshfield.settings import read_settings
 
 DESCRIPTION = """\
 Learn when to update the field and from which views: decisions are drawn from the scenario in virtual time,
@@ -88,7 +90,9 @@ def setting_of(args: argparse.Namespace, scenario: Scenario) -> Setting:
     ScenarioError or ValueError."""
     source, edge = dict(scenario.source), dict(scenario.edge)
     if source.get("kind") == "world" and args.size:
-        source |= {"width": args.size, "height": args.size}
+        size = {"width": args.size, "height": args.size}
+        read_settings(BaseParams, size, "--size")  # before the work: a scene is made in the first episode
+        source |= size
     edge["field"], edge["updates"], edge["field_options"] = "splat", "cycle", tuned.QUICK_SPLAT
     edge["policy"] = {"name": "all"}
     asked = args.parts.split(",")

@@ -42,6 +42,7 @@ from tests.support import refusal, refused
         ("study ppo-wait --scene tower", "scenes of its own"),
         ("train-scheduler room --parts age,smell", "no part is called smell"),
         ("train-scheduler room --omegas 20,60", "select takes none"),
+        ("train-scheduler room --size -5", "--size.width: expected a whole number, 8 to 4096, got -5"),
         ("train-scheduler room --kind wait --omegas 20,soon", "expected milliseconds such as"),
         ("viewpoints tile --budget many", "expected views"),
         ("viewpoints tile --budget 8,9", "expected views"),
