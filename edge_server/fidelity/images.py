@@ -1,13 +1,17 @@
-"""Input of every metric: images become float64 in [0, 1]; anything else is refused by name."""
+"""Input of every metric: images become float64 in [0, 1]; anything else is refused by name. Images as files."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from freshfield.files import write_bytes
 
 Image = NDArray[np.float64]
 Color = tuple[float, float, float]
@@ -79,3 +83,8 @@ def to_bytes(image: NDArray[np.uint8] | NDArray[np.float32]) -> NDArray[np.uint8
         return np.asarray(image, np.uint8)
     unit: NDArray[np.float32] = np.asarray(image, np.float32)
     return (np.clip(unit, 0.0, 1.0) * 255.0 + 0.5).astype(np.uint8)
+
+
+def write_png(path: Path, image: NDArray[np.uint8]) -> None:
+    """Write an RGB image (H, W, 3). Raises OSError, of which OpenCV's own writer says nothing."""
+    write_bytes(path, cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())

@@ -17,9 +17,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-import cv2
 import msgspec
 
+from edge_server.fidelity.images import write_png
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import Score, Scorer
 from edge_server.fields import Field, View, checkpoint
@@ -450,7 +450,7 @@ class EdgeServer:
         try:
             if (comparison := self.state.comparison) is not None:
                 for name, image in _values(comparison, "truth", "rendered").items():
-                    cv2.imwrite(str(self.options.out / f"{name}.png"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+                    write_png(self.options.out / f"{name}.png", image)
         except OSError as error:
             log.error("not everything was written at the end: %s", error)
         finally:

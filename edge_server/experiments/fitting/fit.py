@@ -10,7 +10,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import msgspec
 import numpy as np
 from msgspec.structs import asdict
@@ -24,7 +23,7 @@ from edge_server.experiments.scenes.multiview_still import mean_baselines, open_
 from edge_server.experiments.scenes.recorded import MultiviewStill
 from edge_server.export.run_source import Source, holds_checkpoint, open_source
 from edge_server.export.viewed_field import ViewedField
-from edge_server.fidelity.images import color_behind, to_bytes, to_unit
+from edge_server.fidelity.images import color_behind, to_bytes, to_unit, write_png
 from edge_server.fidelity.lpips_weights import open_lpips
 from edge_server.fidelity.scorer import SELECTED, Scorer
 from edge_server.fields import Budget, FitReport, RefinesCameras, checkpoint
@@ -210,8 +209,8 @@ class Fit(ViewedField):
         write_json(folder / "edge.json", self._status())
         if self._shown is not None:
             truth = to_unit(self._scored_views[0].image, "held-out view", self._scorer.background)
-            _write_png(folder / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
-            _write_png(folder / "rendered.png", to_bytes(self._shown))
+            write_png(folder / "truth.png", np.rint(truth * 255.0).astype(np.uint8))
+            write_png(folder / "rendered.png", to_bytes(self._shown))
         return build_report(folder)
 
     def _about(self) -> dict[str, Any]:
@@ -316,7 +315,3 @@ def _read_lines(path: Path) -> list[dict[str, Any]]:
 
 def _write_lines(path: Path, rows: Sequence[Any]) -> None:
     path.write_text("".join(json.dumps(row, default=asdict, allow_nan=False) + "\n" for row in rows))
-
-
-def _write_png(path: Path, image: NDArray[np.uint8]) -> None:
-    cv2.imwrite(str(path), cv2.cvtColor(image, cv2.COLOR_RGB2BGR))

@@ -153,6 +153,8 @@ def test_what_was_saved_loads_and_renders_the_same(made):
     np.testing.assert_array_equal(again.render(pose, size=(40, 30)), color)
     assert fit.seed == ff.Fit(fit.data, "splat", SMALL_SPLAT).seed == 0
     assert fit.psnr.shape == (len(fit.rows), 2) and fit.psnr[-1, 0] == pytest.approx(1.0, rel=0.3)
+    (folder / "rendered.png").symlink_to("/dev/full")
+    refused(OSError, "No space left", fit.save, folder)
 
 
 def test_ctrl_c_stays_as_it_is_outside_of_the_main_thread():
