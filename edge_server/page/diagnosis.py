@@ -9,6 +9,7 @@ import numpy as np
 from edge_server.fidelity.scorer import SELECTED
 from edge_server.live.state import CameraView, Publication
 from edge_server.page.page_constants import FLAT_MARGIN_DB, FLAT_SCORES, REFUSED_SHARE, STALE_MS
+from edge_server.report.report_constants import TOO_SHORT
 
 
 def poor_picture(flat_db: float | None, publications: Sequence[Publication], cameras: Sequence[CameraView]) -> str:
@@ -37,5 +38,7 @@ def _cause(cameras: Sequence[CameraView], held_out: bool) -> str:
         return f"the edge refuses frames of {', '.join(refusing)}; edge.json counts them by reason."
     if np.median(ages_ms or [0.0]) > STALE_MS:
         return f"frames are {np.median(ages_ms) / 1e3:.0f} s old; see the network."
-    other = "cameras that see different places (tab Coverage)" if held_out else "too short a run so far"
-    return f"poses or lenses that do not fit the images (axes, meters or millimeters, calibration), or {other}."
+    apart = "cameras that see different places (tab Coverage), " if held_out else ""
+    return (
+        f"poses or lenses that do not fit the images (axes, meters or millimeters, calibration), {apart}or {TOO_SHORT}."
+    )

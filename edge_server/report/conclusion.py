@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from edge_server.fidelity.scorer import SELECTED
-from edge_server.report.report_constants import FINAL_PART, LITTLE_DB, WORTH_SAYING
+from edge_server.report.report_constants import FINAL_PART, LITTLE_DB, TOO_SHORT, WORTH_SAYING
 from freshfield.scenario import NOTHING_HELD_OUT
 
 Report = Mapping[str, Any]
@@ -93,11 +93,11 @@ def _limit(report: Report) -> str:
     shown, flat, so_far = fidelity["shown"], fidelity["baseline"]["mean_color_db"], fidelity["so_far"]
     # Where held-out cameras move, `shown` is scored at given poses, which may be wrong where the picture is not.
     still = shown["psnr_still_db"] if so_far is None else so_far["all_psnr_db"]
-    what, few = "What stands still", "too few cameras, poses that do not fit, or too short a run for this machine"
+    what, few = "What stands still", f"too few cameras, poses that do not fit, or {TOO_SHORT}"
     if still is None and SELECTED in fidelity["scored_on"]:
         what, still = "What is shown", fidelity["final"]["psnr_db"]
         # Few cameras do not blur the views that were learned from.
-        few = "poses that do not fit, or too short a run for this machine"
+        few = f"poses that do not fit, or {TOO_SHORT}"
     lost = "; ".join(_delivery(report)).rstrip(".")
     if still is not None and flat is not None and still < flat + LITTLE_DB:
         better = "little better" if still > flat else "no better"

@@ -8,6 +8,7 @@ FINAL_SHARE, FINAL_PART = 0.2, "last fifth"
 LITTLE_DB = 3.0  # above an image of one mean color: a field that gains less shows a blur, whatever the age
 # Share of frames or updates: below that, what was lost or left out is not worth a clause of the conclusion.
 WORTH_SAYING = 0.05
+TOO_SHORT = "too short a run for this machine"  # a likely cause of a poor picture, here and on the live page
 
 # --- events (events) ---
 SILENT_MS = 3000.0  # a camera counts as gone from this age on: longer than any frame of the shipped channels takes

@@ -106,7 +106,7 @@ def test_a_decision_is_told_in_words():
 
 GOOD = CameraView("cam01", False, None, 80.0, 100, 3)
 CASES = {
-    "poses or lenses": [GOOD, replace(GOOD, camera="cam02"), replace(GOOD, camera="cam00", held_out=True)],
+    "for this machine.": [GOOD, replace(GOOD, camera="cam02"), replace(GOOD, camera="cam00", held_out=True)],
     "frames are 9 s old; see the network": [replace(GOOD, age_ms=9000.0), replace(GOOD, age_ms=9100.0)],
     "refuses frames of cam01;": [replace(GOOD, rejected=100), GOOD],
     "1 of 2 cameras have sent": [GOOD, replace(GOOD, age_ms=None)],
