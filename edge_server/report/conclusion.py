@@ -34,7 +34,10 @@ def _shown(report: Report) -> str:
             f"The newest held-out frame read {db:.1f} dB, all {so_far['frames']} so far {so_far['all_psnr_db']:.1f} dB"
         )
     elif db is None:
-        return f"How good the picture was is not known: nothing was scored in the {FINAL_PART} of the run."
+        text = f"How good the picture was is not known: nothing was scored in the {FINAL_PART} of the run"
+        newest = next((row for row in reversed(fidelity["series"]) if row["psnr_db"] is not None), None)
+        earlier = f"; the newest score, {newest['psnr_db']:.1f} dB, is of second {newest['t_s']:.0f}" if newest else ""
+        return f"{text}{earlier}."
     elif report["kind"] == "fit":
         text = f"After {report['seconds']:.0f} s of fitting, {_views(report)} read {db:.1f} dB"
         if final["psnr_refined_db"] is not None:

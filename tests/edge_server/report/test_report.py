@@ -297,7 +297,7 @@ TRAINED_ON = {"fidelity.scored_on": ["selected"], "fidelity.final.psnr_db": 17.4
         ({"updates.count": 0}, 0, "Nothing was shown: the field was never updated."),
         (TRAINED_ON, 0, "publications read 17.4 dB on training views, nothing is held out"),
         ({"fidelity.shown.psnr_db": 12.0}, 0, "worse than an image of one mean color, which reads 14.5 dB."),
-        ({"fidelity.shown.psnr_db": None, "fidelity.final.psnr_db": None}, 0, "is not known"),
+        ({"fidelity.shown.psnr_db": None, "fidelity.final.psnr_db": None}, 0, "; the newest score, 25.9 dB, is"),
         ({"fidelity.so_far": SO_FAR}, 0, "all 9 so far 23.0 dB"),
         ({"fidelity.shown.age_ms.waiting": 0.0}, 2, "Waiting for an update and computing it were the limit"),
         ({"fidelity.shown.age_ms.display": 10.0}, 2, "The network was the limit: it takes the largest part"),
