@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edge_server.fields.splat.layers.depth import layer_depth_constants as tuned
 from edge_server.fields.splat.layers.depth.surfaces import Surface
-from freshfield.geometry import so3_exp, so3_log
+from freshfield.geometry import seen_from, so3_exp, so3_log
 
 Array = NDArray[np.float64]
 
@@ -190,10 +190,10 @@ def _compare(
     turn_i, turn_j, lens = poses[i][:3, :3], poses[j][:3, :3], theirs.surface.lens
     to_i = (ours.points[ours.rows, ours.columns] * scales[i]) @ turn_i.T  # from camera i
     points = to_i + poses[i][:3, 3]
-    local = (points - poses[j][:3, 3]) @ turn_j
     with np.errstate(invalid="ignore", over="ignore"):
-        u, v = np.nan_to_num(lens.project(local), nan=-1.0).T
-    inside = (local[:, 2] > tuned.NEAREST_M) & (u >= 1) & (v >= 1) & (u < lens.width - 1) & (v < lens.height - 1)
+        local, at, inside = seen_from(lens, poses[j], points)
+    u, v = np.nan_to_num(at, nan=-1.0).T
+    inside &= (local[:, 2] > tuned.NEAREST_M) & (u >= 1) & (v >= 1) & (u < lens.width - 1) & (v < lens.height - 1)
     x, y = np.where(inside, u, 0).astype(int), np.where(inside, v, 0).astype(int)
     normal = theirs.normals[y, x] @ turn_j.T
     to_j = (theirs.points[y, x] * scales[j]) @ turn_j.T  # from camera j to its own surface

@@ -66,7 +66,10 @@ def test_cameras_that_share_nothing_stay_as_they_were_reported() -> None:
     surfaces = room_surfaces(2, SIZE)
     away = replace(surfaces[1], pose=se3(surfaces[1].pose[:3, :3], surfaces[1].pose[:3, 3] + [50.0, 0.0, 0.0]))
     blank = replace(surfaces[0], inverse=np.zeros_like(surfaces[0].inverse))
-    for pair in ([surfaces[0], away], [blank, surfaces[1]]):
+    folding, wall = replace(Pinhole.from_fov(SIZE, SIZE, 50.0), distortion=(-0.25, 0.0, 0.0, 0.0)), blank.inverse + 0.5
+    apart = [replace(s, lens=folding, inverse=wall, slope=0 * s.slope) for s in surfaces]  # before one wall
+    apart = [replace(s, pose=se3(np.eye(3), [4.2 * k, 0.0, 0.0])) for k, s in enumerate(apart)]
+    for pair in ([surfaces[0], away], [blank, surfaces[1]], apart):
         for found, surface in zip(register(pair), pair):
             np.testing.assert_allclose(found.pose, surface.pose, atol=1e-9)
             assert found.scale == 1.0
