@@ -156,10 +156,6 @@ class StillField(SteppedField[SplatSnapshot]):
             intake = self.view_store.add(views)
             if intake.box_changed:
                 self._forget_parameters()
-            assert self.view_store.box is not None
-            self._cams = camera_rows(
-                [self._pose_of(v) for v in views], [v.intrinsics for v in views], self.view_store.box
-            )
             self._data: Views = intake.data
             # All of them, where every weight is 0.
             self._asked = supervising_views(self._data) or list(range(len(views)))
@@ -211,7 +207,9 @@ class StillField(SteppedField[SplatSnapshot]):
 
     def _camera(self, view: int) -> NDArray[np.float32]:
         """The row (1, CAMERA) of a view's camera, from where it is learned now."""
-        return self._cams[[view]]
+        one, box = self._views[view], self.view_store.box
+        assert box is not None
+        return camera_rows([self._pose_of(one)], [one.intrinsics], box)
 
     def _target(self, view: int) -> Target:
         """A view as what to learn."""

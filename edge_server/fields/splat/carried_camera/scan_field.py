@@ -80,11 +80,6 @@ class ScanField(StillField):
             self._exposures.center()
             self._poses.take_back(tuned.GAUGE_SHARE)
 
-    def _camera(self, view: int) -> NDArray[np.float32]:
-        one, box = self._views[view], self.view_store.box
-        assert box is not None
-        return camera_rows([self._pose_of(one)], [one.intrinsics], box)
-
     def _target(self, view: int) -> Target:
         target = super()._target(view)._replace(dissimilarity=np.float32(tuned.DISSIMILARITY))
         if self._rigid is None:
