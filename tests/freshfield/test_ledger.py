@@ -168,10 +168,12 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_beside_it(tmp_path):
     assert json.loads(path.read_text()) == {"a": 1} and os.listdir(tmp_path) == ["status.json"]
 
 
-def test_half_a_line_of_a_killed_writer_is_a_line_of_its_own(tmp_path):
+def test_half_a_line_of_a_killed_writer_is_a_line_of_its_own(tmp_path, monkeypatch):
     (tmp_path / "rows.jsonl").write_text('{"a": 1}\n{"a": ')
     lines = Lines(tmp_path / "rows.jsonl")
     assert lines.write('{"a": 2}') and not lines.lost
+    monkeypatch.setattr("os.write", lambda fd, data: len(data) * lines._lock.locked())
+    assert lines.write(""), "another thread may close the file meanwhile"
     lines.close()
     assert not lines.write("late")
     whole, half, new = (tmp_path / "rows.jsonl").read_text().splitlines()

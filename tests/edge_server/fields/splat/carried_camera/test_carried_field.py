@@ -50,6 +50,7 @@ def test_a_frame_is_taken_once_and_not_before_its_turn() -> None:
     for camera, k, expected in (("hand", 2, 2), ("hand", 3, 3), ("hand", 4, 4), ("hand", 5, 4), ("other", 6, 5)):
         field.fit([replace(WALK[k], camera=camera)], Budget(steps=0))
         assert len(field.views) == expected, k
+    assert field.step > tuned.FRESH_STEPS and field._next_view() == 4, "the newest first"
     assert [known.track for known in field._poses.known.values()] == [*["hand"] * 4, "other"]
 
 
