@@ -189,11 +189,8 @@ def _in_processes(
             computed = parallel(joblib.delayed(_compute)(work, task, k) for k, task in enumerate(tasks))
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    try:
-        for number, results in computed:
-            yield tasks[number], results
-    finally:
-        computed.close()  # after an error or Ctrl-C it ends the processes at once
+    for number, results in computed:  # after an error or Ctrl-C, its end ends the processes at once
+        yield tasks[number], results
 
 
 def _on_ray(
