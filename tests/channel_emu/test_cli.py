@@ -62,6 +62,7 @@ def test_mistakes_get_one_line(capsys):
         (["--service", "trace:/no/such/file"], "cannot be read"),
         (["--frame-bytes", "9" * 400], "frame_bytes: expected 0 to"),
         (["--fault", "bandwidth:" + "9" * 400], "bandwidth.megabits_per_s: expected a number"),
+        (["--fault", "blackout:{windows_ms: [[0, 9]], cameras: [cam01]}"], "'cam01' is none of the 1 simulated"),
     ):
         said = refusal(capsys, main, "simulate", *words)
         assert why in said and said.startswith("channel-emu: ")
