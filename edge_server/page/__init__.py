@@ -69,7 +69,7 @@ def start_page(
     """Serve the page of ``state``. Port 0 takes a free one. emulator: HOST:PORT of the channel emulator, for visitors
     to change the network; None: they cannot. Raises PageError if the port is not available,
     TransportError if it would be open to others (see ``Transport.guard``)."""
-    _check_port(host, port)
+    check_port(host, port)
     transport = transport or Transport()
     if words := transport.guard(host, "page", http=True):
         log.warning("--insecure: %s", words)
@@ -154,8 +154,8 @@ def page_url(host: str, port: int, tls: bool = False) -> str:
     return f"http{'s' if tls else ''}://{f'[{host}]' if ':' in host else host}:{port}"
 
 
-def _check_port(host: str, port: int) -> None:
-    """Refuse a taken port or an address of another machine: viser would take the next port, or hang."""
+def check_port(host: str, port: int) -> None:
+    """Raise PageError for a taken port or an address of another machine: viser would take the next port, or hang."""
     if not 0 <= port <= 65535:
         raise PageError(f"page: {port} is not a port; give one from 1 to 65535, or 0 for a free one")
     try:

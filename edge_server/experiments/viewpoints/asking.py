@@ -62,7 +62,7 @@ def compare(
         except (OSError, ViewpointError) as error:
             raise ViewpointError(f"{path}: {error}; move it away, or name another --out") from None
     if who == PERSON:
-        transport.guard(page[0], "preference page", http=True)  # before the fits, which take minutes
+        _check_page(page, transport)  # before the fits, which take minutes
         progress = ProgressLine(sys.stderr)
         with progress.running("reconstructions"):
             made = sprites(
@@ -82,6 +82,16 @@ def compare(
         session = session.answered("left" if first else "right")
         write_json(path, session.as_json())
     return session, None
+
+
+def _check_page(page: tuple[str, int], transport: Transport) -> None:
+    from edge_server.page import PageError, check_port
+
+    transport.guard(page[0], "preference page", http=True)
+    try:
+        check_port(page[0].strip("[]"), page[1])
+    except PageError as error:
+        raise OptionError(str(error)) from None
 
 
 def _on_the_page(

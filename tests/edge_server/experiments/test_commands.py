@@ -50,6 +50,7 @@ from tests.support import refusal, refused
         ("viewpoints tile --budget 4 --selector ppo:none.npz", "not a viewpoint policy"),
         ("viewpoints tower --budget 4", "its cameras look outward"),
         ("viewpoints tile --budget 1 --ask edges", "at least 2 views"),
+        ("viewpoints tile --budget 4 --ask --insecure --page-host 192.0.2.1", "192.0.2.1:8080; choose"),
     ],
 )
 def test_what_cannot_be_done_is_refused_in_one_line(words: str, said: str, tmp_path, capsys) -> None:
