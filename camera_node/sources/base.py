@@ -70,6 +70,7 @@ class Source(ABC):
     recorded_codec: of images that are sent as they were recorded, with their depth; None: they have the scenario's.
     timed: its shots were taken at known times, so that a tracker gave their poses; False for photos, whose poses were
         computed from them.
+    measures: whether depth may come with its shots; False: known to be of none.
 
     A source from outside (``camera_node.settings.own_class``) is constructed with (scenario, config,
     camera). Config: its keys in the scenario, a subclass of ``camera_node.settings.SourceConfig``, whose ``waits`` says
@@ -83,6 +84,7 @@ class Source(ABC):
     repeats_after: int | None = None
     recorded_codec: str | None = None
     timed: bool = True
+    measures: bool = True
     phase_ns: int = 0
     Config: ClassVar[Any] = None
 

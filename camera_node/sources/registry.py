@@ -18,7 +18,7 @@ from camera_node.settings import (
     own_class,
 )
 from camera_node.sources.base import Source
-from freshfield.scenario import Scenario
+from freshfield.scenario import Scenario, ScenarioError
 
 if TYPE_CHECKING:
     from camera_node.synthetic.effects import Effects
@@ -71,5 +71,10 @@ def open_sources(
         if made is not None and (made.image or made.pose or made.depth):
             from camera_node.sources.with_effects import AffectedSource
 
+            if made.depth and not sources[camera].measures:
+                raise ScenarioError(
+                    f"{scenario.path}: source.effects: {camera} has no depth, which a depth sensor (kind depth) would "
+                    "change: leave it out, or name those that have some in its cameras"
+                )
             sources[camera] = AffectedSource(sources[camera], made, config.codec)
     return sources

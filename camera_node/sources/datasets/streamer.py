@@ -223,6 +223,7 @@ class ImageSource(Source):
         self.camera, self.fps = camera, playback.fps
         self.contents, self.timed = len(images), images[0].time_s is not None
         self.intrinsics = images[0].intrinsics
+        self.measures = any(image.depth is not None for image in images)
         self.repeats_after = playback.period if playback.fps == playback.recorded_fps else None
         self._images, self._order, self._playback = images, order, playback
         self._codec, self._poses = codec, poses
