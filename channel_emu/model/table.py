@@ -92,7 +92,7 @@ def read_table(text: str) -> Table:
 
     Raises TableError.
     """
-    numbered = [(k, line.strip()) for k, line in enumerate(text.removeprefix("\ufeff").splitlines(), 1)]
+    numbered = [(k, line.strip()) for k, line in enumerate(text.splitlines(), 1)]
     lines = [(k, line) for k, line in numbered if line and not line.startswith("#")]
     if not lines:
         return Table((), ())

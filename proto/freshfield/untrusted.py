@@ -107,8 +107,9 @@ def read_bytes(path: Path, most_bytes: int = MAX_FILE_BYTES) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Text of a file in UTF-8 that somebody has named. Raises OSError as ``read_bytes``, and UnicodeDecodeError."""
-    return read_bytes(path).decode().replace("\r\n", "\n")
+    """Text of a file in UTF-8, with or without a byte order mark, that somebody has named. Raises OSError as
+    ``read_bytes``, and UnicodeDecodeError."""
+    return read_bytes(path).decode("utf-8-sig").replace("\r\n", "\n")
 
 
 def stored_bytes(path: Path) -> int:

@@ -192,7 +192,7 @@ def test_tum_files_keep_nanoseconds_and_put_w_first(tmp_path):
     between, _ = track.at(1305031102_187652000)
     for pose, angle in ((exact, np.pi / 3), (between, np.pi / 6)):
         np.testing.assert_allclose(pose.matrix()[:3, :3], so3_exp([0, 0, angle]), atol=1e-6)
-    file.write_text("2 1 2 3 0 0 0 1")
+    file.write_text("\ufeff2 1 2 3 0 0 0 1")  # as editors on Windows write it
     assert read_tum(file).at(2_050_000_000)[0].translation_m == (1.0, 2.0, 3.0), "one sample is enough"
 
 
