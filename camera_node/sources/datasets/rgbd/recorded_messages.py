@@ -193,6 +193,8 @@ def _index(messages: Messages) -> _Index:
         if isinstance(record, Picture) and not (record.depth or record.encoding in {*_COLORS, COMPRESSED}):
             index.unread[record.encoding] += 1
             continue
+        if isinstance(record, Calibration) and not any(record.k[:1]):
+            continue  # ROS: a camera that is not calibrated says so by a K that begins with 0
         camera = index.cameras.setdefault(record.frame, _Camera())
         if isinstance(record, Calibration):
             camera.lens = camera.lens or _lens(record, record.k, record.d, where)

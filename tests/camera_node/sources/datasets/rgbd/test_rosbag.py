@@ -172,6 +172,8 @@ def test_of_several_topics_of_a_frame_one_is_taken_and_named(tmp_path):
         ("/apart/image", t, image(t, "rgb8", PICTURE, "apart")),
         ("/apart/camera_info", t, info(t, frame="apart")),
         ("/tf", t, transforms(transform(t, "elsewhere", "apart", MOUNT))),
+        ("/bare/image", t, image(t, "rgb8", PICTURE, "bare")),
+        ("/bare/camera_info", t, info(t, k=[0.0] * 9, frame="bare")),
     ]
     found = open_dataset(write(tmp_path / "run", robot() + said))[1]
     assert found.cameras == (EYE, "other") and np.array_equal(found.of(EYE)[0].read(), PICTURE)
@@ -180,6 +182,7 @@ def test_of_several_topics_of_a_frame_one_is_taken_and_named(tmp_path):
     notes = "\n".join(found.notes)
     assert "/camera/image_mono are of the same instants as those of /camera/image_raw: left out" in notes
     assert "apart hangs on elsewhere, which no transform joins to map: left out" in notes
+    assert "bare has no CameraInfo whose K is not 0: left out" in notes
 
 
 @pytest.mark.stability
