@@ -230,6 +230,8 @@ def _pose(frame: dict[str, Any], where: str) -> np.ndarray:
             matrix = np.vstack([matrix, [0.0, 0.0, 0.0, 1.0]])
         if matrix.shape != (4, 4):
             raise ValueError(f"its shape is {matrix.shape}")
+        if not np.isfinite(matrix).all():  # numpy would warn of it below, beside the error
+            raise ValueError("its numbers are not finite")
         return matrix @ OPENGL_TO_OPENCV
     except KeyError:
         raise DatasetError(f"{where}: 'transform_matrix' is missing") from None

@@ -334,6 +334,7 @@ DAMAGE: dict[str, list[tuple[Change, str]]] = {
         (in_frame(lambda f: f.update(transform_matrix=[[1, 2], [3, 4]])), r"frames\[0\].*transform_matrix"),
         (in_frame(lambda f: f["transform_matrix"][0].__setitem__(0, 7.0)), "orthonormal"),
         (in_frame(lambda f: f["transform_matrix"][0].__setitem__(3, 10**400)), "transform_matrix"),
+        (in_frame(lambda f: f["transform_matrix"][0].__setitem__(3, np.inf)), "its numbers are not finite"),
         (in_frame(lambda f: f.update(transform_matrix=[*zip(*f["transform_matrix"])])), "is it transposed"),
         (in_top(lambda d: d["frames"].append(d["frames"][1])), "2 of its .* the image images/001.png"),
         (in_top(lambda d: d.update(fl_x=10**400)), "fl_x is 10{59}, expected"),
