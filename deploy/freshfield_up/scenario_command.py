@@ -85,7 +85,7 @@ def _check(args: argparse.Namespace) -> int:
 
 def checked(scenario: Scenario) -> list[str]:
     """What each package makes of its section, a line each. Raises ScenarioError."""
-    from camera_node.settings import WorldConfig, errors_of, source_config
+    from camera_node.settings import LiveConfig, WorldConfig, errors_of, source_config
     from camera_node.sources.with_effects import camera_effects
     from camera_node.synthetic import make_scene
     from channel_emu.model.settings import channel_from_mapping
@@ -96,6 +96,15 @@ def checked(scenario: Scenario) -> list[str]:
     if isinstance(source, WorldConfig):
         with errors_of(f"{scenario.path}: source"):
             make_scene(source.scene, {"count": len(scenario.cameras), **source.scene_parameters()})
+    if isinstance(source, WorldConfig | LiveConfig) and source.arm is not None:
+        from camera_node.robot.arm.camera_poses import arm_model, load_hand_eyes
+
+        load_hand_eyes(scenario, source.arm, scenario.cameras)
+        arm_model(scenario, source.arm)
+    if isinstance(source, LiveConfig) and source.trajectory is not None:
+        from camera_node.pose.trajectories import flange_mount
+
+        flange_mount(scenario, source.trajectory, scenario.path.parent)
     channel = channel_from_mapping(
         scenario.channel, f"{scenario.path}: channel", scenario.path.parent, scenario.cameras
     )

@@ -84,6 +84,8 @@ def test_check_reads_every_section(tmp_path, capsys):
         ("source: {kind: world, effects: {OWN:Darker: {counts: 256}}}", "Darker.counts: expected .*0 to 255, got 256"),
         ("source: {kind: OWN:Turning, level: 256}", "source.level: expected .*0 to 255, got 256"),
         ("source: {kind: world, arm: {host: h, cameras: {a: b}, teleop: {speed: 1}}}", "arm.teleop.speed: unknown key"),
+        ("source: {kind: world, arm: {host: h, cameras: {cam00: b}}}", "arm.cameras.cam00: .*/b: cannot be read"),
+        ("source: {kind: oak, trajectory: {files: {cam00: a}, hand_eye: b}}", "hand_eye: .*/b: cannot be read"),
         ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
         ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),
@@ -91,7 +93,8 @@ def test_check_reads_every_section(tmp_path, capsys):
     ):
         file = tmp_path / "mine.yaml"
         source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"
-        file.write_text(f"cameras: {{count: 4, phase: spread}}\n{source}{section.replace('OWN', str(OWN))}\n")
+        phase = "spread" if "mcap" in section else "locked"
+        file.write_text(f"cameras: {{count: 4, phase: {phase}}}\n{source}{section.replace('OWN', str(OWN))}\n")
         assert re.search(wrong, refused(capsys, "scenario", "check", str(file)))
 
 
