@@ -17,6 +17,7 @@ message's index in the call.
 
 from __future__ import annotations
 
+import fcntl
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -76,10 +77,17 @@ class Trace:
 
 
 class TraceWriter:
-    """Writes a trace file, replacing an older one. If the process is killed, only the last lines are lost."""
+    """Writes a trace file, replacing an older one. If the process is killed, only the last lines are lost. Raises
+    TraceError if another emulator writes it, and OSError."""
 
     def __init__(self, path: Path, config: ChannelConfig, seed: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
+        self._lock = path.open("ab")  # changes nothing of a file that is another's
+        try:
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._lock.close()
+            raise TraceError(f"{path}: another emulator writes its trace there: name another file") from None
         self._file = path.open("wb", buffering=tuned.TRACE_BUFFER_BYTES)
         self._line({"freshfield_trace": VERSION, "seed": seed, "channel": config.to_mapping()})
 
@@ -100,6 +108,7 @@ class TraceWriter:
 
     def close(self) -> None:
         self._file.close()
+        self._lock.close()
 
     def _line(self, values: Any) -> None:
         self._file.write(msgspec.json.encode(values) + b"\n")

@@ -20,6 +20,7 @@ def record(path: Path, section: dict, frames: int) -> tuple[trace.Trace, dict[st
     """Two cameras' frames through fresh links, written as the live emulator does; the events by camera."""
     config = channel_from_mapping(section)
     writer, channel = TraceWriter(path, config, 3), Channel(config, 3)
+    refused(TraceError, "another emulator writes its trace there: name", TraceWriter, path, config, 3)
     told: dict[str, list[Event]] = {}
     for camera, phase in (("a", 0), ("b", 7)):
         link = channel.link(camera)
