@@ -64,3 +64,10 @@ def test_what_nobody_asks_for_is_not_imported(name: str) -> None:
     unasked = tuple(UNASKED[name].split())
     code = f"{PROGRAMS[name]}\nimport sys\nprint([name for name in sys.modules if name.startswith({unasked})])"
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "[]"
+
+
+@pytest.mark.parametrize("first", ["freshfield as ff\nff.load", "camera_node.robot.calibration.inputs"])
+def test_opencv_has_its_bound_whoever_imports_it_first(first: str) -> None:
+    code = f"import {first}\nimport cv2, numpy\ncv2.imdecode(numpy.frombuffer(b'P5 5000 5000 255 ', numpy.uint8), 0)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "CV_IO_MAX_IMAGE_PIXELS" in done.stderr

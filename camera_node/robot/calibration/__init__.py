@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from freshfield import payload as payload  # sets OpenCV's size limit before what reads pictures imports cv2
+
 DEFAULT_METHOD = "refined"  # here because the command line shows it without scipy
 
 
