@@ -6,7 +6,6 @@ import json
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -229,7 +228,7 @@ class Launcher:
                     self._say(f"{child.role} did not end in time and was killed; see {child.log}")
 
     def _report(self) -> None:
-        """Write the report, also after a failure, if the run was up."""
+        """Write the report, also after a failure, if the run was up; a Ctrl-C meanwhile ends it."""
         out = self.options.out
         if self.failures and self._ready_s is None:
             self._say("no report: the run did not start")
@@ -238,19 +237,24 @@ class Launcher:
             self._say("no report: no process has written about a frame")
             return
         report = Child("report", "the report", [program("edge-server"), "report", str(out)], out / "log-report.txt")
+        before, until_s = len(self._signals), time.monotonic() + tuned.REPORT_WITHIN_S
         try:
             report.start()
         except OSError as error:
             self._fail(f"no report: {report.log}: {error.strerror}")
             return
-        assert report.process is not None
-        try:
-            code = report.process.wait(tuned.REPORT_WITHIN_S)
-        except subprocess.TimeoutExpired:
+        while report.running and signal.SIGINT.name not in self._signals[before:]:
+            if time.monotonic() > until_s:
+                kill(report)
+                self._fail(f"the report was not ready after {tuned.REPORT_WITHIN_S:.0f} s; see {report.log}")
+                return
+            time.sleep(tuned.STOPPED_POLL_S)
+        if report.running:
             kill(report)
-            self._fail(f"the report was not ready after {tuned.REPORT_WITHIN_S:.0f} s; see {report.log}")
+            self._fail(f"no report (Ctrl-C); to write it: edge-server report {out}")
             return
-        if code != 0:
+        assert report.process is not None
+        if report.process.returncode != 0:
             self._fail(report.exit_summary())
             return
         self._say(summarize(out))

@@ -118,22 +118,27 @@ def test_a_trouble_is_said_once_for_each_camera_whatever_its_numbers(asleep, cap
     assert capfd.readouterr().out.splitlines() == [f"note: {line}" for line in said]
 
 
-def test_ctrl_c_ends_a_run_and_a_second_one_kills(asleep, capfd, monkeypatch):
+def test_ctrl_c_ends_a_run_and_a_second_one_kills_and_one_more_ends_the_report(asleep, capfd, monkeypatch, tmp_path):
     """The second one also while the first is being obeyed; not killed, the node would end by itself."""
     monkeypatch.setattr(launcher.tuned, "GRACE_S", 120.0)
+    (report := tmp_path / "report").write_text("#!/bin/sh\necho up\nsleep 60")
+    report.chmod(0o700)
+    monkeypatch.setattr(launcher, "program", lambda _: str(report))
     stubborn = (
         "import signal, time\nsignal.signal(signal.SIGTERM, lambda *_: print('told'))\nprint('up')\ntime.sleep(60)"
     )
     run = asleep(stubborn)
-    log = run.processes.node.log
+    log, out = run.processes.node.log, run.options.out
 
-    def press_twice() -> None:
-        for word in ("up", "told"):
-            wait_until(lambda word=word: log.exists() and f"\n{word}\n" in log.read_text(), "no node")
+    def press() -> None:
+        for file, word in ((log, "up"), (log, "told"), (out / "log-report.txt", "up")):
+            wait_until(lambda f=file, word=word: f.exists() and f"\n{word}\n" in f.read_text(), f"no {file}")
+            (out / "ledger-edge.tsv").touch()
             run._on_signal(signal.SIGINT, None)
 
-    threading.Thread(target=press_twice, daemon=True).start()
-    assert run.run() == 0 and run.processes.node.killed
+    threading.Thread(target=press, daemon=True).start()
+    assert run.run() == 1 and run.processes.node.killed
+    assert run.failures == [f"no report (Ctrl-C); to write it: edge-server report {out}"], "all else was asked for"
     said = capfd.readouterr().out
     assert "stopping (Ctrl-C)" in said and "the node did not end in time and was killed" in said
 
