@@ -43,8 +43,12 @@ def camera_effects(scenario: Scenario, config: SourceConfig, camera: str) -> Eff
             f"{scenario.path}: source.effects: effects of the kinds delay and mount need source kind world"
         )
     if isinstance(config, WorldConfig) and effects.mount:
-        arm = () if config.arm is None else config.arm.cameras
-        if camera in (*config.carried, *arm):
+        carried = camera in config.carried
+        if config.arm is not None and camera in config.arm.cameras:
+            from camera_node.robot.arm.camera_poses import watching
+
+            carried = not watching(scenario, config.arm, [camera])
+        if carried:
             raise ScenarioError(
                 f"{scenario.path}: source.effects: {camera} is carried, and a bump (kind mount) turns a camera that "
                 "stands still: leave it out, or name those that do in its cameras"

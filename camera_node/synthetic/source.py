@@ -200,9 +200,16 @@ def open_sources(
     with errors_of(f"{scenario.path}: source"):
         scene = make_scene(config.scene, {"count": len(scenario.cameras), **config.scene_parameters()})
     names = _scene_cameras(scenario, scene)
+    still: dict[str, Array] = {}
+    if config.arm is not None:
+        from camera_node.robot.arm.camera_poses import watching
+
+        still = watching(scenario, config.arm, cameras)
+        placed = {names[camera]: (scene.cameras[names[camera]][0], pose) for camera, pose in still.items()}
+        scene = dataclasses.replace(scene, cameras={**scene.cameras, **placed}, static_key=None)
     # Training of a scheduler draws hundreds of motions, each used once.
     folder = default_folder() if config.motion_seed is None else None
-    fps, carriers = config.fps or WORLD_FPS, _carriers(scenario, config, scene, cameras)
+    fps, carriers = config.fps or WORLD_FPS, _carriers(scenario, config, scene, [c for c in cameras if c not in still])
     return {
         camera: WorldSource(
             camera,

@@ -62,6 +62,13 @@ def load_hand_eyes(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]
     return found
 
 
+def watching(scenario: Scenario, config: ArmConfig, cameras: Iterable[str]) -> dict[str, NDArray[np.float64]]:
+    """Camera-to-world (4, 4) of those ``cameras`` of the arm's that stand still and watch it (eye-to-hand), by camera.
+    Raises ScenarioError."""
+    mounts, base = load_hand_eyes(scenario, config, cameras), base_matrix(config)
+    return {camera: base @ mount.transform for camera, mount in mounts.items() if mount.setup == EYE_TO_HAND}
+
+
 def mount_on_flange(scenario: Scenario, config: ArmConfig) -> NDArray[np.float64]:
     """Flange-from-camera (4, 4) of the first camera on the arm. Raises ScenarioError if there is none."""
     for mount in load_hand_eyes(scenario, config, config.cameras).values():
@@ -75,15 +82,10 @@ def camera_poses(scenario: Scenario, config: ArmConfig | None, cameras: Iterable
     its flange. Raises ScenarioError and ArmError."""
     if config is None:
         return {}
-    mounts = load_hand_eyes(scenario, config, cameras)
+    mounts, fixed = load_hand_eyes(scenario, config, cameras), watching(scenario, config, cameras)
     model, base = arm_model(scenario, config), base_matrix(config)
-    moving = [camera for camera, mount in mounts.items() if mount.setup != EYE_TO_HAND]
-    poses: dict[str, PoseProvider] = {
-        camera: FixedPose(Pose.from_matrix(base @ mount.transform))
-        for camera, mount in mounts.items()
-        if camera not in moving
-    }
-    if moving:
+    poses: dict[str, PoseProvider] = {camera: FixedPose(Pose.from_matrix(at)) for camera, at in fixed.items()}
+    if moving := [camera for camera in mounts if camera not in fixed]:
         from camera_node.robot.arm.joint_states import ArmStream, FlangePoses
 
         stream = ArmStream(

@@ -1,5 +1,6 @@
 """Sources as the node uses them: ticks, frames held out of a carried camera's path, effects on the wire."""
 
+import json
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -154,9 +155,9 @@ def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-def cameras(effects: dict[str, Any], count: int = 3, scene: str = "tower", seed: int = 5) -> dict[str, Camera]:
-    source = small_world(scene=scene, width=24, height=16, fps=10, codec="zstd", effects=effects)
-    top = {"seed": seed, "cameras": {"count": count, "held_out": ["cam00"]}, "source": source}
+def cameras(effects: dict[str, Any], count: int = 3, **more: Any) -> dict[str, Camera]:
+    source = small_world(scene="tower", width=24, height=16, fps=10, codec="zstd", effects=effects, **more)
+    top = {"seed": 5, "cameras": {"count": count, "held_out": ["cam00"]}, "source": source}
     scenario = parse(top, Path("world.yaml"))
     return {c.name: c for c in build_cameras(scenario, source_config(scenario), scenario.cameras)}
 
@@ -194,7 +195,7 @@ def test_a_depth_sensor_measures_with_every_camera_but_the_held_out_one_and_chan
     assert found["cam01"].source.key() == plain["cam01"].source.key(), "rendered frames are found again"
 
 
-def test_a_bumped_camera_shows_another_view_from_then_on_and_reports_its_old_pose():
+def test_a_bumped_camera_shows_another_view_from_then_on_and_reports_its_old_pose(tmp_path):
     bump = {"at_s": 1.0, "pitch_deg": 1.0, "cameras": ["cam01"]}
     refused(ScenarioError, "effects.bump.cameras: 'cam1' is not one", cameras, {"bump": {**bump, "cameras": ["cam1"]}})
     found, plain = cameras({"bump": bump, "depth_sensor": {}}), cameras({"depth_sensor": {}})
@@ -209,6 +210,12 @@ def test_a_bumped_camera_shows_another_view_from_then_on_and_reports_its_old_pos
     again = plain["cam01"].source.contents
     assert made(found["cam01"], again + 9)[0] != made(plain["cam01"], 9)[0], "it stays turned"
     assert made(found["cam01"], 9) == made(plain["cam01"], 9), "in any order"
+    # One that watches an arm stands still where its calibration says, too: here in the other one's place.
+    eye = {"setup": "eye-to-hand", "transform": plain["cam02"].source.read(0).pose.matrix().tolist()}
+    (tmp_path / "eye.yaml").write_text(json.dumps(eye))
+    watches = cameras({"bump": bump}, arm={"host": "127.0.0.9", "cameras": {"cam01": str(tmp_path / "eye.yaml")}})
+    same = [watches["cam01"].capture(k).payload == watches["cam02"].capture(k).payload for k in (9, 10)]
+    assert same == [True, False], "bumped at the tenth frame"
 
 
 def test_a_wrong_pose_is_claimed_of_the_right_image():
