@@ -271,13 +271,8 @@ class Chessboard(Target):
         steps = [np.linalg.norm(np.diff(pixels, axis=k), axis=2).min() for k in (0, 1)]
         window = int(np.clip(min(steps) / 3, tuned.LEAST_WINDOW_PX, tuned.MOST_WINDOW_PX))
         pixels = cv2.cornerSubPix(image, pixels.reshape(-1, 1, 2), (window, window), (-1, -1), _SUBPIX)
-        pixels = pixels.reshape(down, across, 2).astype(np.float64)
-        # The detector may start at either end: of the two end squares, the one at the first corner is darker.
-        first = pixels[:2, :2].mean(axis=(0, 1))
-        last = pixels[-2:, -2:].mean(axis=(0, 1))
-        if _mean_level(image, first) > _mean_level(image, last):
-            pixels = pixels[::-1, ::-1]
-        return Corners(np.asarray(pixels.reshape(-1, 2) + 0.5, dtype=np.float64), self._places)
+        # The detector begins at the black one of the two end squares, whichever way up the board is.
+        return Corners(pixels.reshape(-1, 2).astype(np.float64) + 0.5, self._places)
 
     def draw(self, width: int) -> GrayImage:
         across, down = self._counts
@@ -296,11 +291,6 @@ class Chessboard(Target):
 
 
 _KINDS = {"charuco": Charuco, "chessboard": Chessboard}
-
-
-def _mean_level(image: GrayImage, at: Array) -> float:
-    x, y = np.rint(at).astype(int)
-    return float(image[max(0, y - 1) : y + 2, max(0, x - 1) : x + 2].mean())
 
 
 def _counts(text: str) -> tuple[int, int]:
