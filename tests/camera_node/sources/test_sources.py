@@ -1,6 +1,5 @@
 """Sources as the node uses them: ticks, frames held out of a carried camera's path, effects on the wire."""
 
-import json
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -211,8 +210,8 @@ def test_a_bumped_camera_shows_another_view_from_then_on_and_reports_its_old_pos
     assert made(found["cam01"], again + 9)[0] != made(plain["cam01"], 9)[0], "it stays turned"
     assert made(found["cam01"], 9) == made(plain["cam01"], 9), "in any order"
     # One that watches an arm stands still where its calibration says, too: here in the other one's place.
-    eye = {"setup": "eye-to-hand", "transform": plain["cam02"].source.read(0).pose.matrix().tolist()}
-    (tmp_path / "eye.yaml").write_text(json.dumps(eye))
+    at = plain["cam02"].source.read(0).pose.matrix().tolist()
+    (tmp_path / "eye.yaml").write_text(f"{{setup: eye-to-hand, transform: {at}}}")
     watches = cameras({"bump": bump}, arm={"host": "127.0.0.9", "cameras": {"cam01": str(tmp_path / "eye.yaml")}})
     same = [watches["cam01"].capture(k).payload == watches["cam02"].capture(k).payload for k in (9, 10)]
     assert same == [True, False], "bumped at the tenth frame"
