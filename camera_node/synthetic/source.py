@@ -205,6 +205,7 @@ def open_sources(
         from camera_node.robot.arm.camera_poses import watching
 
         still = watching(scenario, config.arm, cameras)
+    if still:
         placed = {names[camera]: (scene.cameras[names[camera]][0], pose) for camera, pose in still.items()}
         scene = dataclasses.replace(scene, cameras={**scene.cameras, **placed}, static_key=None)
     # Training of a scheduler draws hundreds of motions, each used once.
