@@ -62,7 +62,6 @@ def compare(
         except (OSError, ViewpointError) as error:
             raise ViewpointError(f"{path}: {error}; move it away, or name another --out") from None
     if who == PERSON:
-        _check_page(page, transport)  # before the fits, which take minutes
         progress = ProgressLine(sys.stderr)
         with progress.running("reconstructions"):
             made = sprites(
@@ -84,7 +83,8 @@ def compare(
     return session, None
 
 
-def _check_page(page: tuple[str, int], transport: Transport) -> None:
+def check_page(page: tuple[str, int], transport: Transport) -> None:
+    """OptionError or TransportError where a page cannot be served there: said before the fits, which take minutes."""
     from edge_server.page import PageError, check_port
 
     transport.guard(page[0], "preference page", http=True)

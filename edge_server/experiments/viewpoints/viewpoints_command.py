@@ -10,7 +10,7 @@ from camera_node.sources.datasets.records import DatasetError
 from edge_server.command import command_parser, exit_status
 from edge_server.experiments.common.arguments import OptionError, add_folders, at_least, folders_of
 from edge_server.experiments.viewpoints import capture_constants as tuned
-from edge_server.experiments.viewpoints.asking import ANSWERS, compare
+from edge_server.experiments.viewpoints.asking import ANSWERS, check_page, compare
 from edge_server.experiments.viewpoints.drawing import draw_plan
 from edge_server.experiments.viewpoints.stage import open_embedder, open_stage
 from edge_server.fidelity.lpips_weights import open_lpips
@@ -63,6 +63,9 @@ def _run(args: argparse.Namespace) -> None:
     selector = make_selector(args.selector)  # refused before anything is rendered
     if not 0.0 <= args.travel < math.inf:
         raise OptionError(f"--travel {args.travel:g}: expected 0 or more")
+    page, secured = (args.page_host, args.page_port), transport.from_arguments(args)
+    if args.ask == PERSON:
+        check_page(page, secured)
     stage = open_stage(args.scenario, args.candidates, data=folders.data)
     if isinstance(selector, CandidatePolicy):
         selector.embed = open_embedder(stage.background)[0]
@@ -83,8 +86,8 @@ def _run(args: argparse.Namespace) -> None:
             steps=args.steps,
             seed=args.seed,
             out=args.out,
-            page=(args.page_host, args.page_port),
-            transport=transport.from_arguments(args),
+            page=page,
+            transport=secured,
         )
         agreed, repeated = session.agreement
         print(f"answered by {session.by}: {session.model.says()}; repeated pairs alike: {agreed} of {repeated}")
