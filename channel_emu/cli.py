@@ -147,7 +147,7 @@ def _add_simulate(commands: Any) -> None:
         "age, frames delivered and dropped, time shares of the states, and delays.",
     )
     _add_channel_options(sub)
-    sub.add_argument("--cameras", type=int, default=1, metavar="N", help="number of cameras [%(default)s]")
+    sub.add_argument("--cameras", type=int, metavar="N", help="number of cameras [the scenario's, else 1]")
     sub.add_argument("--seconds", type=float, default=600.0, metavar="S", help="seconds to simulate [%(default)g]")
     sub.add_argument("--seed", type=int, default=0, metavar="N", help="random seed [%(default)s]")
     sub.add_argument(
@@ -213,14 +213,11 @@ def _add_channel_options(sub: argparse.ArgumentParser) -> None:
 def _simulate(args: argparse.Namespace) -> int:
     from channel_emu.virtual.simulate import OUTCOMES, simulate
 
-    config = _config_of(args)
+    config, count = _config_of(args), args.cameras
+    if count is None:
+        count = list(scenario.load(args.scenario).cameras) if args.scenario else 1
     simulation = simulate(
-        config,
-        args.cameras,
-        args.seconds,
-        args.seed,
-        frame_period_ms=args.frame_period_ms,
-        frame_bytes=args.frame_bytes,
+        config, count, args.seconds, args.seed, frame_period_ms=args.frame_period_ms, frame_bytes=args.frame_bytes
     )
     result = simulation.summary()
     if args.csv:

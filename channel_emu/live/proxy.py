@@ -76,7 +76,8 @@ class Proxy(grpc.GenericRpcHandler):
     """Usage: ``start``, then ``stop``; or ``run``. Needs a running event loop.
 
     config, seed: of the emulated channel. most_calls: open at once; each takes 30 kB.
-    Raises TransportError if the address cannot be used, OSError if the trace cannot be created.
+    Raises TransportError if the address cannot be used, OSError if the trace cannot be created,
+    TraceError if another emulator writes it.
     """
 
     streams_last: ClassVar[bool] = False

@@ -85,9 +85,11 @@ class TraceWriter:
         self._lock = path.open("ab")  # changes nothing of a file that is another's
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._lock.close()
-            raise TraceError(f"{path}: another emulator writes its trace there: name another file") from None
+        except OSError as error:
+            # Devices such as /dev/null are for all, and some file systems have no locks.
+            if isinstance(error, BlockingIOError) and path.is_file():
+                self._lock.close()
+                raise TraceError(f"{path}: another emulator writes its trace there: name another file") from None
         self._file = path.open("wb", buffering=tuned.TRACE_BUFFER_BYTES)
         self._line({"freshfield_trace": VERSION, "seed": seed, "channel": config.to_mapping()})
 

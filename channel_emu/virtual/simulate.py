@@ -149,8 +149,7 @@ def simulate(
             raise SimulationError(f"{name}: expected {least:g} to {most:g}, got {value}")
     if strange := [name for name in getattr(config.faults.get("blackout"), "cameras", ()) if name not in names]:
         raise SimulationError(
-            f"faults.blackout.cameras: {strange[0]!r} is none of the {count} simulated, from {names[0]} on: simulate "
-            "more, or name one of them"
+            f"faults.blackout.cameras: {strange[0]!r} is none of the {count} simulated: {', '.join(names)}"
         )
     period_ms = frame_period_ms or config.arrivals.period_ms or tuned.FRAME_PERIOD_MS
     generated = config.arrivals.process == "poisson" and frame_period_ms is None

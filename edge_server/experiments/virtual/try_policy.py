@@ -67,7 +67,7 @@ def try_policy(
         ``freshfield.Policy``.
     scenario: a file, or the name of a shipped one; with a held-out camera there are scores.
     seconds: of virtual time. seed: in place of the scenario's.
-    Raises OptionError, ScenarioError or DatasetError.
+    Raises ScenarioError, DatasetError, or ValueError for a time that no run can take.
     """
     check_seconds(seconds)
     opened = load(str(scenario), seed)

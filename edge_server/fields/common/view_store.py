@@ -79,8 +79,8 @@ class ViewStore:
         self._box_cameras = tuned.FINAL_BOX_CAMERAS
 
     def forget_scene(self) -> None:
-        """Find the scene's box and its background anew, from the views that come next."""
-        self.box, self._box_cameras, self._packed = None, 0, None
+        """Forget the views, too: box and background are found anew, from those that come next."""
+        self.box, self._box_cameras, self._packed, self.memory = None, 0, None, {}
 
     def forget_views(self) -> None:
         """Forget the views; box and background stay."""

@@ -53,7 +53,7 @@ def load_dataset(path: Path, options: ImageOptions = FULL_SIZE) -> Dataset:
 class FoxgloveMessages(Messages):
     where: Path
     name = "Foxglove's messages"
-    needs = (f"{_CALIBRATION} whose K is not 0", _TRANSFORM)
+    needs = (f"{_CALIBRATION} of a calibrated camera (whose K is not 0)", _TRANSFORM)
 
     def read(self, topic: str | None = None, log_ns: int = 0) -> Iterator[tuple[str, int, Record]]:
         try:

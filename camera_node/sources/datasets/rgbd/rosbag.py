@@ -45,7 +45,7 @@ class BagMessages(Messages):
     """The bag stays open: images are read when they are needed, by any thread."""
 
     name = "ROS messages"
-    needs = ("CameraInfo whose K is not 0", "tf")
+    needs = ("CameraInfo of a calibrated camera (whose K is not 0)", "tf")
 
     def __init__(self, where: Path) -> None:
         try:

@@ -144,9 +144,9 @@ class CarriedField(ScanField):
 
     @property
     def _founded(self) -> bool:
-        """Whether any depth was measured or told by frames. A camera that only turns, or sees a bare wall, tells none:
-        what the field shows then is a guess, with which no frame has to agree."""
-        return self._measured or self._seen_m > 0.0
+        """Whether any depth was measured or told by frames. A camera that only turns, or sees a bare wall, which fits at
+        any depth, tells none: what the field shows then is a guess, with which no frame has to agree."""
+        return self._measured or (self._seen_m > 0.0 and not self._bare)
 
     def _sweep(self, view: View) -> NDArray[np.float32] | None:
         """Depth of a view from the keyframes beside it, at the poses that are believed."""
@@ -269,6 +269,7 @@ class CarriedField(ScanField):
         fits = found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING
         taken = (fits and not leapt) or reports.left_out_in_a_row >= tuned.PATIENCE
         reports.left_out_in_a_row = 0 if taken else reports.left_out_in_a_row + 1
+        reports.suggested = None if taken else reports.suggested
         return taken
 
     def _leave_out(self, view: View) -> None:

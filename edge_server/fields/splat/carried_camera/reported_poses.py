@@ -168,7 +168,7 @@ class OwnMotion:
     def located(self, view: View, camera: str, pose: Array, scale: float) -> View:
         """The view at a pose (4, 4) that its picture was found at, and no longer at the reported one."""
         known = self.of(camera)
-        known.missed, known.replaced, known.doubts = 0, known.replaced + 1, tuned.DOUBTS
+        known.missed, known.replaced, known.doubts, known.suggested = 0, known.replaced + 1, tuned.DOUBTS, None
         before = self.before(view, camera)
         if len(before) == 1 and before[0].reported is None:
             before[0].reported, before[0].scale = before[0].given, scale  # for frames before the first keyframe
