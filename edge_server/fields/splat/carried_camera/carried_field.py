@@ -144,8 +144,8 @@ class CarriedField(ScanField):
 
     @property
     def _founded(self) -> bool:
-        """Whether any depth was measured or told by frames. A camera that only turns, or sees a bare wall, which fits at
-        any depth, tells none: what the field shows then is a guess, with which no frame has to agree."""
+        """Whether any depth was measured or told by frames. A camera that only turns tells none, nor does a bare wall,
+        which fits at any depth: what the field shows then is a guess, with which no frame has to agree."""
         return self._measured or (self._seen_m > 0.0 and not self._bare)
 
     def _sweep(self, view: View) -> NDArray[np.float32] | None:
