@@ -170,8 +170,12 @@ def test_depth_that_nothing_tells_is_guessed_and_said_until_frames_tell_it(begin
         assert field.view_store.box == given(carried_field(), clean[:6]).view_store.box
 
 
-# On average over four instants, with depth and without, in dB; at a single one 1 dB more.
-MOST_LOST = {_looks_about: (1.0, 0.5), _at_a_wall: (0.3, 0.8), _under_a_hand: (0.3, 0.8)}
+# In dB, with depth and without: on average over four instants, and at each of them.
+MOST_LOST = {
+    _looks_about: ((1.0, 1.0), (0.5, 1.0)),
+    _at_a_wall: ((0.3, 1.2), (0.8, 1.0)),
+    _under_a_hand: ((0.3, 1.2), (0.8, 1.8)),
+}
 
 
 @pytest.mark.slow  # 20 s each
@@ -185,8 +189,8 @@ def test_a_bad_beginning_is_forgotten_within_two_seconds(begin, depth: bool) -> 
     for seed in carried.SEEDS:
         found_db = carried.by_seconds(views, views, given(carried_field(seed=seed), _beginning(begin, clean[0])))
         lost.append(np.array(carried.undisturbed(depth, seed))[:4] - found_db)
-    mean_db, most_db = np.mean(lost, axis=0), MOST_LOST[begin][not depth]
-    assert mean_db.mean() < most_db and mean_db.max() < most_db + 1.0
+    mean_db, (most_db, most_at_once_db) = np.mean(lost, axis=0), MOST_LOST[begin][not depth]
+    assert mean_db.mean() < most_db and mean_db.max() < most_at_once_db
 
 
 @pytest.mark.stability
