@@ -94,7 +94,7 @@ class TrackerPoses:
     def _add(self, line: bytes) -> bool:
         """Whether the line holds no pose that was known, or too old."""
         try:
-            sample = read_sample(line.decode(errors="replace"), str(self.path))
+            sample = read_sample(line.decode("utf-8-sig", errors="replace"), str(self.path))
         except DatasetError as error:
             self.refused += 1
             if self.refused == 1:
