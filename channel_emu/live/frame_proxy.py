@@ -138,7 +138,7 @@ class FrameProxy(Proxy):
         async with self.streams.open(context) as call:
             try:
                 # Nodes wait for this before they send.
-                await context.send_initial_metadata(())
+                await call.send(context.send_initial_metadata, ())
                 while (raw := await context.read()) is not grpc.aio.EOF:
                     response, flow = self._take(raw, flow, call)
                     await call.write(response.SerializeToString())

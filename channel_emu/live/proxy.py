@@ -256,7 +256,7 @@ class Proxy(grpc.GenericRpcHandler):
         call = self.service_channel.stream_stream(method)(metadata=metadata, timeout=context.time_remaining())
         parts = [
             asyncio.create_task(_carry_up(up, context, call)),
-            asyncio.create_task(_carry_down(down, context, call)),
+            asyncio.create_task(_carry_down(down, context, call, served)),
         ]
         try:
             done, _ = await asyncio.wait(parts, return_when=asyncio.FIRST_COMPLETED)
@@ -316,9 +316,11 @@ async def _carry_up(flow: CallFlow, context: grpc.aio.ServicerContext, call: grp
             await call.done_writing()
 
 
-async def _carry_down(flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall) -> None:
-    await context.send_initial_metadata(_passed_on(await call.initial_metadata()))
-    await flow.carry(call.read, context.write)
+async def _carry_down(
+    flow: CallFlow, context: grpc.aio.ServicerContext, call: grpc.aio.StreamStreamCall, served: ServedCall
+) -> None:
+    await served.send(context.send_initial_metadata, _passed_on(await call.initial_metadata()))
+    await flow.carry(call.read, served.write)
 
 
 def _passed_on(metadata: Any) -> tuple[tuple[str, str | bytes], ...]:

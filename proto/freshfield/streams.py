@@ -92,10 +92,16 @@ class ServedCall:
             self.task.cancel()
 
     async def write(self, answer: Any) -> None:
-        """Send an answer. ``end`` waits for it: a call cancelled during a write cannot send a status."""
-        self._writing = True
-        await self._context.write(answer)
-        self._writing = False
+        """Send an answer, as ``send`` does."""
+        await self.send(self._context.write, answer)
+
+    async def send(self, operation: Callable[..., Awaitable[None]], *arguments: Any) -> None:
+        """Await ``operation`` of the context, which sends an answer or the initial metadata. ``end`` waits for it: a
+        call cancelled while it sends cannot send a status, and its client waits without end."""
+        if self._status is None:
+            self._writing = True
+            await operation(*arguments)
+            self._writing = False
         if self._status is not None:
             raise asyncio.CancelledError
 

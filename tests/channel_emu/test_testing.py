@@ -3,6 +3,7 @@
 import itertools
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Iterator
 from concurrent import futures
 
@@ -154,6 +155,14 @@ def test_metadata_status_trailers_and_deadline_pass(channel, greeter):
 def test_a_reset_ends_a_call_whose_request_has_passed(greeter, channel):
     link = channel({"faults": {"reset": {"at_ms": [500.0]}}}, to=greeter.address)
     assert code_of(lambda **o: list(client(link).unary_stream(COUNT)(b"300", **o))) == "UNAVAILABLE"
+
+
+def test_calls_that_a_reset_ends_in_the_midst_of_an_answer_are_told_so(greeter, channel):
+    """One of a hundred waited without end: a call cannot send two things at once."""
+    link = channel({"faults": {"reset": {"at_ms": [10.0 * k for k in range(1, 900)]}}}, to=greeter.address)
+    echo = client(link).stream_stream(ECHO)
+    codes = Counter(code_of(lambda **o: deque(echo(itertools.repeat(bytes(3000)), **o), 0)) for _ in range(300))
+    assert set(codes) == {"UNAVAILABLE"}, codes
 
 
 def test_cancellation_reaches_the_service_and_frees_the_link(channel, greeter):

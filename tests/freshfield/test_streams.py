@@ -23,7 +23,7 @@ async def echoing(streams: OpenStreams):
 
     async def answer(_, context):
         async with streams.open(context) as call:
-            await context.send_initial_metadata(())
+            await call.send(context.send_initial_metadata, ())
             while (message := await context.read()) is not grpc.aio.EOF:
                 if message == b"use":
                     call.use()
