@@ -2,7 +2,7 @@
 
   import freshfield as ff
 
-They live in the programs, which are imported only when a name is used: a process that uses none of them imports none.
+The programs define them and are imported on first use of a name, so a process that uses none imports no program.
 """
 
 from __future__ import annotations

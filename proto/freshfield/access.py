@@ -1,7 +1,7 @@
 """Who may do what: one access model for gRPC, the page and the metrics.
 
-A caller authenticates with a token or, over mutual TLS, with a certificate. Either stands for a name, which
-gives the role::
+A caller authenticates with a token or, over mutual TLS, with a certificate. Either identifies a caller name, which
+determines the role::
 
     operator    viewer    camera:cam00    camera:cam00,cam01    camera:*
 
@@ -53,7 +53,7 @@ class Caller:
 
     @classmethod
     def named(cls, name: str) -> Caller:
-        """The caller that a name such as ``camera:cam00`` stands for. Raises ValueError if it is none."""
+        """The caller with a name such as ``camera:cam00``. Raises ValueError for an invalid name."""
         role, _, listed = name.partition(":")
         cameras = frozenset() if listed == "*" else frozenset(listed.split(","))
         if role == "camera" and all(valid_id(camera) for camera in cameras):
@@ -76,7 +76,7 @@ caller: ContextVar[Caller] = ContextVar("caller", default=ANYBODY)
 
 
 def parse_tokens(text: str) -> dict[str, str]:
-    """Token by caller name of a token file: lines NAME TOKEN; one token alone gets the name "". Raises ValueError."""
+    """Tokens by caller name, from lines NAME TOKEN; a single token alone gets the name "". Raises ValueError."""
     lines = [line.split() for line in text.splitlines() if line.strip()]
     tokens = {words[0] if len(words) == 2 else "": words[-1] for words in lines}
     if not lines:
@@ -97,7 +97,7 @@ class Access:
     tokens: token by caller name.
     certificates: whether a client certificate's common name identifies the caller if no token is sent; a
         wrong token is refused even with a valid certificate.
-    Raises ValueError for a name that is none.
+    Raises ValueError for an invalid caller name.
     """
 
     def __init__(self, tokens: Mapping[str, str], certificates: bool) -> None:
@@ -147,10 +147,10 @@ class HttpRefused(Exception):
 
 
 class HttpDoor:
-    """The same checks for an HTTP server.
+    """Access checks of an HTTP server.
 
     access: who may log in. No login is asked for if it is open, or on loopback if it has no tokens.
-    listening_on: address or name that the server was told to listen on.
+    listening_on: address or name that the server listens on, as configured.
     """
 
     def __init__(self, access: Access, listening_on: str) -> None:

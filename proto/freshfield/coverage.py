@@ -1,8 +1,8 @@
-"""What fixed cameras can see of a scene, reckoned from their poses and lenses alone.
+"""How much of a scene fixed cameras can see, estimated from their poses and lenses alone.
 
-Nothing is known of the scene but where the cameras look. A surface there may be at any place near that point and face
-any way, so the shares below are means over places and directions: a surface is seen by a camera if it lies within the
-image and faces the camera by less than MOST_OBLIQUE_DEG. Whatever hides it is not known and not counted.
+The geometry of the scene is unknown; only the point that the cameras look at is. Surfaces are assumed near that point,
+at every position and orientation, and the shares below are means over them. A camera sees a surface if it lies within
+the image and its normal is less than MOST_OBLIQUE_DEG off the viewing ray. Occlusion is ignored.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 
 from freshfield.geometry import Array, Pinhole, converging_point, look_at, seen_from
 
-PLACES = 9  # a side of the grid of places within the ball
+PLACES = 9  # grid points per side, within the ball
 DIRECTIONS = 48  # of a surface's normal
-REACH = 0.5  # radius of the ball of places, of the cameras' distance to its center
-UNKNOWN_DISTANCE_M = 3.0  # to the scene, where the optical axes do not meet: the depth of a small room
-MOST_OBLIQUE_DEG = 75.0  # beyond it a camera sees a surface too obliquely to tell its texture
-CANDIDATES = 48  # places for a further camera, around the scene
-PLAN = 41  # cells a side of the plan
+REACH = 0.5  # radius of the ball, as a share of the cameras' distance to its center
+UNKNOWN_DISTANCE_M = 3.0  # least distance assumed where the optical axes do not meet: the depth of a small room
+MOST_OBLIQUE_DEG = 75.0  # a camera sees a surface at a larger angle too obliquely to resolve its texture
+CANDIDATES = 48  # candidate positions of a further camera, around the scene
+PLAN = 41  # cells per side of the plan
 
-# What `room` reached with so many cameras, dB of the whole image and where it moves: with depth sensors
+# PSNR of `room` in dB by number of cameras, over the whole image and over moving pixels: with depth sensors
 # (docs/results/few-cameras.json), and without (docs/fields.md).
 REACHED_WITH_DEPTH = {2: (22.4, 18.6), 3: (24.7, 21.0), 4: (26.2, 22.3)}
 REACHED = {2: (14.8, 15.7), 3: (19.2, 19.2), 4: (22.6, 22.1), 6: (26.0, 22.9), 8: (27.5, 24.2), 12: (28.9, 25.4)}
@@ -34,15 +34,15 @@ Camera = tuple[Pinhole, Array]
 
 @dataclass(frozen=True)
 class Coverage:
-    """What cameras see.
+    """The coverage of a set of cameras.
 
-    seen_by: share of all surfaces that exactly 0, 1, 2, ... cameras see.
-    parallax_deg: median over the surfaces that several cameras see of the widest angle between two of these cameras;
-        None where no surface is seen by two.
-    further_pose: camera-to-world (4, 4), the best place for one more camera. further_seen_by: ``seen_by`` with it.
+    seen_by: shares of the surfaces that exactly 0, 1, 2, ... cameras see.
+    parallax_deg: widest angle between two cameras that see a surface, median over the surfaces that several see;
+        None if no two cameras see the same surface.
+    further_pose: camera-to-world (4, 4), best pose of one more camera. further_seen_by: ``seen_by`` with it.
     center_m: (3,), the point the cameras look at.
-    plan: int (PLAN, PLAN), number of cameras whose image contains each place of the horizontal plane through the
-        center; ``plan_axes`` (2, 3) are its right and its upper edge's direction, ``plan_m`` its side.
+    plan: int (PLAN, PLAN), number of cameras whose image contains each cell of the horizontal plane through the
+        center. plan_axes: (2, 3), unit vectors toward its right and upper edge. plan_m: its side.
     """
 
     seen_by: tuple[float, ...]
@@ -66,21 +66,21 @@ class Coverage:
 
 
 def reached(cameras: int, depth: bool) -> str:
-    """What was measured with as many cameras, or the next fewer, in words. depth: they measure it."""
+    """The fidelity measured with this or the next smaller number of cameras, in words. depth: they measure it."""
     reached = REACHED_WITH_DEPTH if depth else REACHED
     known = [count for count in reached if count <= cameras]
     if not known:
-        return "One camera alone shows its own view, and little else"
+        return "A single camera reproduces its own view and little else"
     whole_db, moving_db = reached[known[-1]]
     sensors = "with depth sensors" if depth else "without depth sensors"
     return (
-        f"The shipped room with {known[-1]} cameras {sensors} was shown at {whole_db:g} dB, {moving_db:g} where it "
-        "moves; above some 25 dB a picture looks right, one mean color reaches some 15"
+        f"The shipped room with {known[-1]} cameras {sensors} reached {whole_db:g} dB, {moving_db:g} on moving "
+        "pixels; an image above some 25 dB looks right, one of a single mean color reaches some 15"
     )
 
 
 def reckon(cameras: Sequence[Camera]) -> Coverage:
-    """What ``cameras`` see. ValueError: there is none."""
+    """Compute the coverage of ``cameras``. Raises ValueError if there are none."""
     if not cameras:
         raise ValueError("no camera has a pose")
     poses = np.stack([pose for _, pose in cameras])
@@ -173,8 +173,8 @@ def _further(
     normals: Array,
     frame: tuple[Array, Array, Array, Array],
 ) -> tuple[Array, tuple[float, ...]]:
-    """The best of places around the scene, as far and as high as the cameras stand and with the lens of the first. A
-    surface counts once if it is seen, and half as much again if by two."""
+    """The best of CANDIDATES positions around the scene, at the cameras' distance and height, with the lens of the
+    first. A surface that one camera sees counts 1, one that several see 1.5."""
     center, up, right, forward = frame
     offsets = np.stack([pose[:3, 3] for _, pose in cameras]) - center
     height = float(np.median(offsets @ up))

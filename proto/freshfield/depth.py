@@ -1,9 +1,9 @@
-"""An image of measured depth, as a camera gives it and as it travels.
+"""A depth image and its encoding on the wire.
 
-The payload is lossless. Sensors measure disparity in steps, so that an image holds few different counts: where they are
-few, their sorted table goes first and each pixel is its place in the table (of simulated stereo, 128 x 128, this
-halves the bytes). Then each pixel that measured something becomes the difference to the one before it, low and high
-bytes go apart, and zstandard compresses both.
+The encoding is lossless. Sensors quantize disparity, so an image often has few distinct counts. If so, a sorted
+table of them precedes the pixels, which become indices into it (for simulated stereo of 128 x 128 this halves the
+size). Valid pixels are then replaced by the difference to the previous valid one, low and high bytes are separated,
+and zstandard compresses both.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from freshfield.limits import MAX_DEPTH_GAP_NS, MAX_IMAGE_SIDE_PX, MAX_PAYLOAD_B
 from freshfield.payload import PayloadError, declared_bytes, inflate
 
 _COUNTS = 2**16 - 1
-"""Number of counts that measure something; differences are taken modulo it, which leaves symbol 0 to holes."""
+"""Number of valid counts; differences are taken modulo it, which reserves symbol 0 for holes."""
 _TABLE_PIXELS = 16
-"""Fewest pixels for each entry of a table: for exact depth, with more different counts, a table adds 15 % of bytes."""
+"""Fewest pixels per table entry: exact depth has more distinct counts, and a table would add 15 % to its size."""
 _ZSTD_LEVEL = 3
-"""Of 640 x 480 level 1 takes .7 ms less and up to 9 % more bytes; level 9 takes 9 ms more for 6 % less."""
+"""For 640 x 480, level 1 saves .7 ms and takes up to 9 % more bytes; level 9 takes 9 ms more and saves 6 %."""
 
 
 @dataclass(frozen=True)
 class EncodedDepth:
-    """Depth in a frame. payload: of ``DepthImage.encode``. Further fields as of ``DepthImage``."""
+    """Encoded depth of a frame. payload: from ``DepthImage.encode``. The other fields are as in ``DepthImage``."""
 
     payload: bytes
     width: int
@@ -39,7 +39,7 @@ class EncodedDepth:
     after_image_ns: int = 0
 
     def check(self, image: Pinhole, image_bytes: int) -> None:
-        """Refuse depth that must not be decoded or cannot belong to its image, in microseconds.
+        """Refuse depth that must not be decoded or cannot belong to its image; takes microseconds.
 
         image: intrinsics of the frame's image. image_bytes: size of its payload.
         Raises PayloadError: ``too_large``, ``bad_payload``, ``size_mismatch`` (other than announced, or registered
@@ -66,7 +66,7 @@ class EncodedDepth:
             raise PayloadError("size_mismatch", f"zstd does not declare the bytes of {self.width} x {self.height}")
 
     def decode(self) -> DepthImage:
-        """The depth, of a payload that passed ``check``. Raises PayloadError ``undecodable`` for damaged data."""
+        """Decode a payload that passed ``check``. Raises PayloadError ``undecodable`` for damaged data."""
         size = declared_bytes(self.payload)
         low, high = np.frombuffer(inflate(self.payload, size), np.uint8).reshape(2, -1)
         words = low | high.astype(np.uint16) << 8
@@ -91,11 +91,11 @@ class DepthImage:
     """Depth along the optical axis, measured with (and usually at the instant of) an image.
 
     counts: uint16 (H, W), depth in counts; 0 where nothing was measured.
-    meters_per_count: .001 where counts are millimeters.
-    intrinsics: of the depth sensor, for H x W pixels. None: each pixel is registered to the image, whose
-        intrinsics, scaled to H x W, hold.
-    to_camera: pose of the depth sensor in the axes of the image's camera; None: they are the same.
-    after_image_ns: its capture time minus that of the image; negative where it was measured before.
+    meters_per_count: .001 if counts are millimeters.
+    intrinsics: of the depth sensor, for H x W pixels. None: depth is registered to the image and has its
+        intrinsics, scaled to H x W.
+    to_camera: pose of the depth sensor in the image camera's axes; None: the two coincide.
+    after_image_ns: capture time of the depth minus that of the image; negative if measured earlier.
     """
 
     counts: NDArray[np.uint16]
@@ -109,7 +109,7 @@ class DepthImage:
         return self.counts * np.float32(self.meters_per_count)
 
     def encode(self) -> EncodedDepth:
-        """Compress it. Raises PayloadError ``bad_image`` for an array that is no such image."""
+        """Compress the image. Raises PayloadError ``bad_image`` for an array of another shape or type."""
         counts, k = self.counts, self.intrinsics
         if counts.dtype != np.uint16 or counts.ndim != 2 or not counts.size:
             raise PayloadError("bad_image", f"depth: expected uint16 (H, W), got {counts.dtype} {counts.shape}")

@@ -1,4 +1,4 @@
-"""Files that are complete at any time they are read: replaced atomically, or appended line by line.
+"""Files that a reader always finds complete: replaced atomically, or appended line by line.
 
 A full disk does not stop a process that appends: lost lines are counted, so a reader knows how many are
 missing.
@@ -28,7 +28,7 @@ def write_json(path: Path, data: Any, indent: int | None = None) -> None:
 
 
 def read_status(path: Path) -> dict[str, Any]:
-    """The contents of a JSON file that a process of ours replaces from time to time; {} if it cannot be read."""
+    """Contents of a JSON status file, which one of our processes replaces regularly; {} if it cannot be read."""
     try:
         found = json.loads(path.read_bytes())
     except (OSError, ValueError):
@@ -119,7 +119,7 @@ class Lines:
     ``lost``; the first of them is logged.
 
     first: line to write on opening, if not empty.
-    Raises OSError if the file cannot be opened, or ``first`` not be written.
+    Raises OSError if the file cannot be opened or ``first`` cannot be written.
     """
 
     def __init__(self, path: Path, first: str = "") -> None:
@@ -161,4 +161,4 @@ class Lines:
     def _lose(self, why: str) -> None:
         self.lost += 1
         if self.lost == 1:
-            log.warning("%s: cannot be written (%s); lines are lost until it can be again", self.path, why)
+            log.warning("%s: cannot be written (%s); lines are lost until writing works again", self.path, why)

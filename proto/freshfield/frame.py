@@ -99,8 +99,8 @@ def counted_ids(header: pb.FrameHeader, cameras: Container[str]) -> tuple[str, s
 
 
 def checksum(request: pb.PushRequest) -> int:
-    """CRC32C over the header's fields, packed in a fixed order, and the payload; then over the same of the depth, if
-    there is any. It covers the header because a flipped bit must not become a wrong pose."""
+    """CRC32C over the header's fields, packed in a fixed order, and the payload; then over those of the depth, if any.
+    It covers the header because a flipped bit must not become a wrong pose."""
     header = request.header
     numbers = (*_COUNTS(header), header.codec & _UINT32, header.width, header.height, header.role & _UINT32)
     packed = _PACKED.pack(*numbers, *_POSE(header.pose), *_LENS(header.intrinsics))
@@ -201,8 +201,8 @@ def from_request(request: pb.PushRequest) -> Frame:
     """Check a message and return its frame, the payload still encoded.
 
     Raises FrameRejected with reason bad_id, bad_header, crc_mismatch, bad_pose, bad_intrinsics, or a reason
-    of ``payload.check`` (too_large, unknown_codec, bad_payload, size_mismatch). For depth each of these begins
-    with ``depth_``, and ``depth_bad_header`` is one more.
+    of ``payload.check`` (too_large, unknown_codec, bad_payload, size_mismatch). Reasons of depth have the prefix
+    ``depth_`` and include ``depth_bad_header``.
     """
     h = request.header
     if not valid_id(h.camera_id) or not valid_id(h.session_id):

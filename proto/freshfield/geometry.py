@@ -234,8 +234,7 @@ def on_sphere(
 
 
 def converging_point(origins: Array, directions: Array) -> Array | None:
-    """The point (3,) nearest to all rays (N, 3) in least squares; None where they run parallel or apart, or begin
-    there."""
+    """The point (3,) nearest to all rays (N, 3) in least squares; None if they are parallel, diverge or start there."""
     projectors = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     total = projectors.sum(axis=0)
     if np.linalg.eigvalsh(total)[0] < 1e-3 * len(origins):
@@ -359,8 +358,8 @@ class Pinhole:
         )
 
     def _undistort(self, xd: Array, yd: Array) -> tuple[Array, Array]:
-        """The point that the lens shows at (xd, yd). Two of Newton's steps end what is left of ``_nearly_undistorted``,
-        of wide lenses up to a pixel at the corners; near a fold they lead astray, and are not taken."""
+        """The point that the lens maps to (xd, yd). Two Newton steps remove the residual of ``_nearly_undistorted``, up
+        to a pixel at the corners of wide lenses; near a fold they diverge and are not taken."""
         k1, k2, p1, p2 = self.distortion
         x, y = self._nearly_undistorted(xd, yd)
         for _ in range(2):
@@ -380,7 +379,7 @@ class Pinhole:
         return x, y
 
     def _nearly_undistorted(self, xd: Array, yd: Array) -> tuple[Array, Array]:
-        # Fixed-point iteration, OpenCV's way; eight rounds reach 1e-6 for lenses met in practice.
+        # Fixed-point iteration, as in OpenCV; eight rounds reach 1e-6 for lenses met in practice.
         k1, k2, p1, p2 = self.distortion
         x, y = xd, yd
         for _ in range(8):
@@ -405,8 +404,8 @@ def world_rays(camera: Pinhole, camera_to_world: ArrayLike) -> tuple[Array, Arra
 
 
 def seen_from(camera: Pinhole, camera_to_world: ArrayLike, points: ArrayLike) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Points (N, 3) of the world in camera axes, their pixels (N, 2), NaN behind the camera, and whether the image
-    contains each (N,)."""
+    """World points (N, 3) in camera axes, their pixels (N, 2), NaN behind the camera, and whether each is in the image
+    (N,)."""
     m = np.asarray(camera_to_world, dtype=np.float64)
     local = (np.asarray(points, dtype=np.float64) - m[:3, 3]) @ m[:3, :3]
     at = camera.project(local)
@@ -424,8 +423,8 @@ _RASTER_POINTS = 33  # points a side at which a lens is checked
 # All frames of a camera have the same lens; the cache is bounded because a hostile sender's may differ.
 @lru_cache(maxsize=1024)
 def invertible(camera: Pinhole) -> bool:
-    """Whether the lens model can be inverted: undistortion, before its last steps, followed by projection returns each
-    point of a grid over the whole image, edges included, within MAX_LENS_ERROR_PX. Undistortion diverges for
+    """Whether the lens model can be inverted: undistortion (without its Newton steps) followed by projection returns
+    each point of a grid over the whole image, edges included, within MAX_LENS_ERROR_PX. Undistortion diverges for
     coefficients that no real lens has."""
     if not camera.distorted:
         return True

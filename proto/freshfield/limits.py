@@ -1,4 +1,4 @@
-"""What frames, streams, connections and files may be at most, for every process, with unit and reason.
+"""Limits of frames, streams, connections and files, for every process, with unit and reason.
 
 A frame, a scenario or a stream that exceeds one of these is refused where it arrives, and the refusal is
 counted by its reason. Bounds of settings (in the sections of a scenario) are defined with the settings; what one
@@ -20,16 +20,16 @@ MAX_IMAGE_SIDE_PX = 4096
 """Width and height of a decoded image: 50 MB of RGB, which bounds the cost of a decompression bomb."""
 
 METERS_PER_COUNT = (1e-6, 1.0)
-"""Scale of depth in 16 bits: at the least its range is 6.5 cm, less than any sensor's, at the most 65 km."""
+"""Scale of 16-bit depth: the smallest gives a range of 6.5 cm, less than any sensor's, the largest 65 km."""
 
 USUAL_DEPTH_M = (0.02, 200.0)
-"""Half of an image's depth lies between these, or its unit is another: 1 m read as millimeters is 1 km or 1 mm."""
+"""Bounds of an image's median depth; outside them, its unit is wrong: 1 m read as millimeters is 1 km or 1 mm."""
 
 MAX_DEPTH_GAP_NS = 10**10
-"""Time between an image and its depth. Streams of a camera are some 100 ms apart, replays of a slow sensor seconds."""
+"""Time between an image and its depth: some 100 ms between a camera's streams, seconds in replays of a slow sensor."""
 
 MAX_PNG_CHUNKS = 10_000
-"""Chunks of a PNG, because a decoder reads all. Encoders write 8 kB or more per chunk: 1000 in 8 MB."""
+"""Chunks of a PNG, because a decoder reads them all. Encoders write 8 kB or more per chunk: 1000 in 8 MB."""
 
 MAX_JPEG_SEGMENTS = 1000
 """Segments and fill bytes before a JPEG's first scan. A camera writes some ten; a 16 MB profile takes 250."""
@@ -44,7 +44,7 @@ MAX_PEER_TEXT_CHARS = 200
 """Length of a peer's text in a log line."""
 
 MAX_REASONS = 32
-"""Number of a peer's reasons of refusals that are counted separately: a broken peer may invent reasons."""
+"""Number of a peer's refusal reasons that are counted separately: a broken peer may invent reasons."""
 
 # --- files ------------------------------------------------------------------------------------
 
@@ -68,8 +68,8 @@ MAX_CAMERAS = 1000
 """Number of cameras of a scenario, each with a stream, so that one connection serves them all."""
 
 MAX_STREAMS_PER_CAMERA = 4
-"""Number of open streams at a process, for each of its cameras: one is in use, others may be closing after a
-restart. Beyond that a new stream ends the one of least use."""
+"""Number of open streams at a process, per camera: one is in use, others may be closing after a restart. Beyond that,
+a new stream ends the least used one."""
 
 TLS_HANDSHAKE_TIMEOUT_S = 5.0
 """How long a connection to the page or to gRPC may last without a completed handshake."""
@@ -87,14 +87,14 @@ MAX_CONCURRENT_STREAMS = 1024
 
 MAX_CALLS = 3 * MAX_CAMERAS
 """Open calls of a server, on all its connections, unless it says how many it needs: three for each camera of the
-largest scenario. A new one ends one that carried nothing."""
+largest scenario. A new call ends one that carried no message."""
 
 MAX_PENDING_CALLS = 1000
-"""Calls that came and wait to be handled: all cameras of the largest scenario may connect at once. More are refused,
-from here on some of them, from 1.5 times as many on all."""
+"""Calls waiting to be handled: all cameras of the largest scenario may connect at once. Above this number some further
+calls are refused, above 1.5 times as many all of them."""
 
 FIRST_MESSAGE_TIMEOUT_S = 10.0
-"""How long a call of a method that takes one message may last without it."""
+"""How long a call of a unary-request method may stay open before its message arrives."""
 
 MAX_SESSIONS_PER_CAMERA = 64
 """Number of sessions remembered for a camera: many, because a forgotten session could be replayed."""

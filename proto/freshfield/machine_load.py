@@ -1,6 +1,6 @@
 """Processor and memory use of this process, of another one, and of the whole machine.
 
-Values come from /proc; what the system does not tell is None, never a guess.
+Values come from /proc; what the system does not report is None, never a guess.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class LoadMeter:
         """A row of ``processes.jsonl``: ``{"t_s", NAME: {"rss_mb", "cpu", "pid"}, ..., "machine": {"cpu"}}``.
 
         t_s: time of the row. processes: id by name; None: this process alone. ``cpu`` is in cores, 0 in the first
-        row of a process. What the system does not tell, or has ended, is left out.
+        row of a process. Unreported values and ended processes are left out.
         """
         row: dict[str, Any] = {"t_s": round(t_s, 3)}
         for name, pid in (self._own if processes is None else processes).items():

@@ -42,9 +42,8 @@ class Cameras(Settings, frozen=True):
 
     phase: of a synthetic world's cameras. ``locked``: all capture at the same instants, as in the thesis;
         ``spread``: each at its own seeded phase, like cameras without a common trigger.
-    held_out_every: for cameras that are carried about: of so many captures of a training camera the first is not its
-        own, but is sent as a frame of the held-out camera of the same place in the lists; 0: held-out cameras are
-        cameras of their own.
+    held_out_every: for moving cameras: the first of every so many captures of a training camera is sent as a frame of
+        the held-out camera at the same index of the list instead; 0: held-out cameras are separate cameras.
     """
 
     count: Annotated[int, within(0, MAX_CAMERAS, "number of cameras, named cam00, cam01, ...")] = 0
@@ -96,9 +95,9 @@ class Scenario:
 
     @property
     def max_side_px(self) -> int:
-        """Bound on the image sides that the cameras send: the larger of the source's width and height if both
-        are given, else MAX_IMAGE_SIDE_PX. It is that, too, for kind ``camera``, because a camera that does
-        not support the given size sends its own."""
+        """Largest image side that the cameras may send: the larger of the source's width and height if both are
+        given, else MAX_IMAGE_SIDE_PX; always that for kind ``camera``, because a camera that does not support the
+        given size sends another."""
         if self.source.get("kind") == "camera":
             return MAX_IMAGE_SIDE_PX
         sides = [self.source.get(name) for name in ("width", "height")]
@@ -135,7 +134,7 @@ def seed_sequence(seed: int, purpose: str, camera: str = "") -> np.random.SeedSe
 def load(path: str | Path, seed: int | None = None) -> Scenario:
     """Read and check a scenario file.
 
-    path: the file, or the name of a shipped scenario, such as ``room``, which a folder of that name does not hide.
+    path: the file, or the name of a shipped scenario, such as ``room``, even if a folder has that name.
     seed: replaces the file's seed.
     Raises ScenarioError.
     """

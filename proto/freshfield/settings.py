@@ -1,4 +1,4 @@
-"""Settings: what a mapping of a scenario file may hold, as a struct whose fields state bounds and help.
+"""Settings: the keys of a mapping in a scenario file, as a struct whose fields state bounds and help.
 
     class Blur(Settings, frozen=True):
         exposure_ms: Annotated[float, within(0, 1000, "time that the shutter is open")] = 20.0

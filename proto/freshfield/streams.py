@@ -1,7 +1,7 @@
 """The open calls of a server: who may make one, which one is ended to admit a new one, and which one owns a session.
 
-Without ``Admission``, a call whose headers come without a message reaches no handler, and Health/Watch never ends by
-itself: a client could open a thousand of either on each connection, at 4 to 30 kB of memory a call.
+Without ``Admission``, a call that sends headers but no message never reaches a handler, and Health/Watch never ends:
+a client could open a thousand of either on each connection, at 4 to 30 kB of memory per call.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from freshfield.limits import FIRST_MESSAGE_TIMEOUT_S, MAX_SESSIONS_PER_CAMERA, 
 
 # How long ``end`` waits for the client to take an answer that is being written.
 _TAKEN_S = 0.5
-_HEALTH = "/grpc.health.v1.Health/"  # open to everybody: it only tells that the process works
+_HEALTH = "/grpc.health.v1.Health/"  # open to everybody: it only reports whether the process works
 
 
 async def serve_health(server: grpc.aio.Server, services: Sequence[str]) -> health.aio.HealthServicer:
@@ -40,15 +40,15 @@ async def serve_health(server: grpc.aio.Server, services: Sequence[str]) -> heal
 
 
 def refuse(context: grpc.aio.ServicerContext, code: grpc.StatusCode, why: str) -> None:
-    """End a call whose handler now returns. ``context.abort`` instead keeps its exception, and with it the memory of
-    the call until the garbage collector comes: 8 kB each."""
+    """End a call whose handler now returns. ``context.abort`` would keep its exception, and with it the call's memory
+    (8 kB), until the garbage collector runs."""
     context.set_code(code)
     context.set_details(why)
 
 
 class ServedCall:
-    """Async context around the handling of a call, which ``end`` can end from another task. Within another context of
-    the same task it is that one: see ``of``.
+    """Async context around the handling of a call, which ``end`` can end from another task. Contexts nested in one task
+    are the same object: see ``of``.
 
     open: whether the context has not been left yet.
     """
@@ -63,7 +63,7 @@ class ServedCall:
         self._status: tuple[grpc.StatusCode, str] | None = None
         self._writing = False
         self.held_in: list[OpenStreams] = []
-        """Where the call has a place."""
+        """The collections that hold a place for the call."""
 
     @staticmethod
     @contextlib.asynccontextmanager
@@ -199,8 +199,8 @@ class SessionStreams:
 
 
 class Admission(grpc.aio.ServerInterceptor):
-    """Passes a gRPC call to its handler if the caller may make it. At most ``most`` are open; a new one ends one that
-    carried no message, or else the one that carried none for longest."""
+    """Passes a gRPC call to its handler if the caller may make it. At most ``most`` are open; a new one ends a call
+    that carried no message, or else the one idle for longest."""
 
     def __init__(self, access: Access, most: int) -> None:
         self.calls = OpenStreams(most)
@@ -236,7 +236,7 @@ class Admission(grpc.aio.ServerInterceptor):
                     await call.write(response)
                 return None
 
-        # A stream of requests to gRPC, whatever the method: a handler of a single request is called only after it.
+        # Registered as request streaming whatever the method: gRPC calls a unary handler only once its message came.
         kind = (
             grpc.stream_stream_rpc_method_handler
             if handler.response_streaming
@@ -259,7 +259,7 @@ class Admission(grpc.aio.ServerInterceptor):
 
 
 async def _only_message(context: grpc.aio.ServicerContext) -> Any:
-    """The message of a call that has one; EOF if it does not come in time."""
+    """The single message of a unary call; EOF if it does not arrive in time."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(FIRST_MESSAGE_TIMEOUT_S):
             return await context.read()

@@ -158,7 +158,7 @@ class Transport:
             raise TransportError(f"--token-file of a process that listens: a line is NAME TOKEN: {error}") from None
 
     def guard(self, host: str, what: str, http: bool = False) -> str:
-        """Check that listening on ``host`` is secure: loopback, or encrypted and authenticated.
+        """Check that it is secure to listen on ``host``: loopback, or encrypted and authenticated.
 
         what: name of the service, for the message.
         http: callers can authenticate with tokens only, not with certificates.
@@ -166,7 +166,7 @@ class Transport:
         """
         missing = [] if self.cert else ["nothing is encrypted (--tls-cert, --tls-key)"]
         if self.access.open:
-            missing.append(f"nobody is asked who they are (--token-file{'' if http else ' or --tls-ca'})")
+            missing.append(f"callers are not authenticated (--token-file{'' if http else ' or --tls-ca'})")
         elif http and not self.tokens:
             missing.append("nobody can log in (--token-file)")
         if is_loopback(host) or not missing:

@@ -1,4 +1,4 @@
-"""Reads files that an attacker may have written or named: of YAML and JSON, no more than they hold.
+"""Reads files that an attacker may have written or named, with bounded expansion of YAML and JSON.
 
 A few hundred bytes of YAML or pickle can refer to themselves so often that they expand to gigabytes.
 Expansion is therefore bounded by the file's size: an honest file has fewer values than bytes, even with
@@ -86,12 +86,12 @@ def refuse_expansion(value: Any, most: int, parts: Callable[[Any], Iterable[Any]
         seen += 1
         waiting.extend(parts(waiting.pop()))
         if seen + len(waiting) > most:
-            raise UntrustedError(f"its references stand for more than {most} values")
+            raise UntrustedError(f"its references expand to more than {most} values")
 
 
 def check_file(path: Path, most_bytes: int = MAX_FILE_BYTES) -> None:
-    """Refuse what cannot be read to its end: a pipe hangs in silence, and a device never ends. Raises OSError: there
-    is no such file, it is no regular one, or it is larger than ``most_bytes``."""
+    """Refuse what cannot be read to its end: a pipe blocks silently, and a device never ends. Raises OSError if the
+    file does not exist, is not a regular one, or is larger than ``most_bytes``."""
     about = path.stat()
     if not stat.S_ISREG(about.st_mode):
         raise OSError(errno.EINVAL, "a folder, a device or a pipe, not a file")

@@ -130,7 +130,7 @@ def test_damage_is_left_out_and_said(tmp_path):
 def test_what_is_no_recording_says_so_and_one_is_never_overwritten(tmp_path):
     for data in (b"", b"\x89MCAP0", b"not an MCAP file at all"):
         (tmp_path / "x.mcap").write_bytes(data)
-        refused(SessionError, r"x\.mcap: is no MCAP file", Session, tmp_path / "x.mcap")
+        refused(SessionError, r"x\.mcap: is not an MCAP file", Session, tmp_path / "x.mcap")
     refused(FileExistsError, "", SessionWriter, tmp_path / "x.mcap", {})
 
 

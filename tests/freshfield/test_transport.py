@@ -144,8 +144,8 @@ def test_a_server_refuses_to_listen_unprotected_beyond_this_machine():
         (Transport(ca=Path("ca")), "127.0.0.1", "--tls-ca .* needs --tls-cert"),
         (Transport(tokens={"": "x"}), "127.0.0.1", "NAME TOKEN"),
         (RIGHT, "0.0.0.0", "nothing is encrypted"),
-        (Transport(**tls), "0.0.0.0", "nobody is asked"),
-        (Transport(), "[::]", "nothing is encrypted .* and nobody is asked"),
+        (Transport(**tls), "0.0.0.0", "callers are not authenticated"),
+        (Transport(), "[::]", "nothing is encrypted .* and callers are not authenticated"),
     ):
         refused(TransportError, why, given.guard, host, "gRPC")
     with pytest.raises(TransportError, match="machines, and nobody can log in"):
@@ -155,7 +155,7 @@ def test_a_server_refuses_to_listen_unprotected_beyond_this_machine():
     for host in ("127.0.0.1", "127.1.2.3", "::1", "[::1]", "localhost"):
         assert Transport().guard(host, "page") == ""
     words = Transport(insecure=True).guard("0.0.0.0", "page")
-    assert "nothing is encrypted" in words and "nobody is asked" in words
+    assert "nothing is encrypted" in words and "callers are not authenticated" in words
 
 
 async def test_a_token_does_not_leave_the_machine_in_plain_text():

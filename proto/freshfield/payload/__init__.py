@@ -4,7 +4,7 @@ The limits are checked on headers *before* anything is decompressed: a 109 kB PN
 OpenCV allocates as many bytes as a PNG's chunk claims (one flipped bit: 4 GB, 5 s), and the zstandard decoder
 ignores ``max_output_size`` for a frame that declares its size.
 
-OpenCV is imported by what encodes and decodes: the emulator only checks headers, and runs without it.
+Only encoding and decoding import OpenCV: the emulator only checks headers and runs without it.
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def _halved(image: NDArray[np.uint8], halvings: int) -> NDArray[np.uint8]:
         even = cv2.copyMakeBorder(image, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
         half = even.shape[1] // 2, even.shape[0] // 2
         small = np.asarray(cv2.resize(even, half, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-        if image.shape[2] == 4:  # straight alpha: a mean of colors counts each as far as it is seen
+        if image.shape[2] == 4:  # straight alpha: colors are averaged with alpha as their weight
             blocks = even.reshape(small.shape[0], 2, small.shape[1], 2, 4).astype(np.float32)
             alpha = blocks[..., 3:]
             seen = (blocks[..., :3] * alpha).sum(axis=(1, 3)) / np.maximum(alpha.sum(axis=(1, 3)), 1.0)

@@ -33,11 +33,11 @@ def png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def pixels_only(data: bytes) -> bytes:
-    """A PNG of the chunks that the pixels need.
+    """The PNG reduced to the chunks that its pixels need.
 
     data: a PNG that ``png_size`` accepts.
-    Raises ValueError with what is wrong: the header names no format of PNG, or the image data inflate to fewer or
-    more bytes than the image has. Never inflates more than those.
+    Raises ValueError if the header names no PNG format, or the image data inflate to fewer or more bytes than the
+    image has. Never inflates more than those.
     """
     depth, color, _, _, interlaced = data[24:29]
     if color not in _CHANNELS or depth not in (1, 2, 4, 8, 16) or interlaced > 1:

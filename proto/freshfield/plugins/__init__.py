@@ -1,14 +1,14 @@
-"""Classes from outside freshfield, by name: a source, policy, effect, fault, field or selector of somebody else.
+"""Plug-ins: third-party classes by name, each a source, policy, effect, fault, field or selector.
 
-A name that is not built in is, in this order,
+A name that is not built in is resolved in this order:
 
 - ``FILE.py:CLASS``, a class of a file; FILE is looked for beside the scenario, then in the working directory;
 - ``MODULE:CLASS``, a class of an installed module;
 - the name of an entry point of an installed package, in the group ``freshfield.KIND`` (``freshfield.policy``, ...).
 
-Nothing is imported that nobody names. A name comes from a scenario file or from the command line of whoever starts a
-program: both are trusted as programs are. What others wrote (a run's folder, a recording, a message) names nothing
-that is loaded: see ``refuse_foreign``.
+Only named classes are imported. Names come from a scenario file or the command line of the user who starts a program;
+both are trusted like programs. Names in files from elsewhere (a run's folder, a recording, a message) are not loaded:
+see ``refuse_foreign``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MODULE = re.compile(r"(?P<where>[A-Za-z_]\w*(\.\w+)*):(?P<name>[A-Za-z_]\w*)(?P
 
 
 class PluginError(ScenarioError):
-    """A class from outside cannot be used; the message says why."""
+    """A plug-in class cannot be used; the message says why."""
 
 
 def is_reference(name: str) -> bool:
@@ -45,7 +45,7 @@ def is_reference(name: str) -> bool:
 
 
 def split_value(text: str) -> tuple[str, str]:
-    """A name and what follows its last colon, as in ``threshold:120`` or ``mine.py:Mine:120``; empty: nothing does."""
+    """Split a name from the value after its last colon (``threshold:120``, ``mine.py:Mine:120``); "" if it has none."""
     match = _FILE.fullmatch(text) or _MODULE.fullmatch(text)
     if match is None:
         name, _, value = text.partition(":")
@@ -54,8 +54,8 @@ def split_value(text: str) -> tuple[str, str]:
 
 
 def find(kind: str, name: str, built_in: Iterable[str]) -> Any:
-    """The class of this name, which is not built in. kind: one of KINDS. Raises PluginError; its message lists what
-    there is, ``built_in`` first."""
+    """The plug-in class of this name. kind: one of KINDS. Raises PluginError; its message lists the known names,
+    ``built_in`` first."""
     match = _FILE.fullmatch(name) or _MODULE.fullmatch(name)
     if match is not None:
         where, load = match["where"], _file_module if match.re is _FILE else importlib.import_module
@@ -83,8 +83,8 @@ def installed(kind: str) -> list[str]:
 
 
 def absolute(data: Any, folder: Path) -> Any:
-    """A scenario's content with the FILE of each FILE.py:CLASS, in keys and values, made absolute where ``folder`` has
-    it, so that every process finds it."""
+    """A scenario's content in which the FILE of each FILE.py:CLASS (key or value) is absolute if ``folder`` has the
+    file, so that every process finds it."""
     if isinstance(data, Mapping):
         return {absolute(key, folder): absolute(value, folder) for key, value in data.items()}
     if isinstance(data, list):
@@ -96,8 +96,8 @@ def absolute(data: Any, folder: Path) -> Any:
 
 
 def files_named(data: Any) -> list[Path]:
-    """The source files, sorted, of every class from outside that a JSON value names, as far as they exist, with what
-    they import from their own folder; of a package, all of its files."""
+    """The existing source files, sorted, of every plug-in class that a JSON value names, and what they import from
+    their own folder; for a package, all of its files."""
     found, open_ = set[Path](), [data]
     while open_:
         value = open_.pop()
@@ -143,7 +143,7 @@ def _add_sources(path: Path | None, found: set[Path]) -> None:
         return
     try:
         tree = ast.parse(path.read_bytes())
-    except (SyntaxError, ValueError):  # said where it is imported
+    except (SyntaxError, ValueError):  # reported when it is imported
         return
     for node in ast.walk(tree):
         names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
@@ -156,14 +156,14 @@ def _add_sources(path: Path | None, found: set[Path]) -> None:
 
 
 def short_name(name: str) -> str:
-    """A name for people: without the folder of FILE.py:CLASS."""
+    """A name for display: FILE.py:CLASS without the folder."""
     match = _FILE.fullmatch(name)
     return name if match is None else f"{Path(match['where']).name}:{match['name']}{match['rest']}"
 
 
 def refuse_foreign(kind: str, name: str, source: str, allowed: bool) -> None:
-    """Raise PluginError if a file that somebody else may have written names a class outside, unless that is allowed.
-    source: what the file is."""
+    """Raise PluginError if a possibly foreign file names a plug-in class, unless that is allowed.
+    source: description of the file."""
     if is_reference(name) and not allowed:
         raise PluginError(
             f"{source} names the {kind} {name}, code from outside freshfield: to run it, if you trust it, "
@@ -172,7 +172,7 @@ def refuse_foreign(kind: str, name: str, source: str, allowed: bool) -> None:
 
 
 def _file_module(path: str) -> ModuleType:
-    """The module of a file, executed once a process."""
+    """The module of a file, executed once per process."""
     file = Path(path).expanduser().absolute()
     name = f"freshfield_plugin_{file.stem}_{hashlib.sha256(str(file).encode()).hexdigest()[:12]}"
     if name not in sys.modules:

@@ -2,8 +2,8 @@
 
 Topics, CAMERA being a camera's id:
 
-    /CAMERA/header       freshfield.v1.FrameHeader    the frame's header as it came over the wire
-    /CAMERA/depth        freshfield.v1.Depth          its depth as it came, if it brought any; before the image
+    /CAMERA/header       freshfield.v1.FrameHeader    the frame's header as received
+    /CAMERA/depth        freshfield.v1.Depth          its depth as received, if any; before the image
     /CAMERA/image        foxglove.CompressedImage     its payload; jpeg, png, or zstd, which viewers lack
     /CAMERA/pose         foxglove.PoseInFrame         camera-to-world; frame ``world``
     /CAMERA/calibration  foxglove.CameraCalibration   when it changes; OpenCV's pixel origin

@@ -7,7 +7,7 @@
     /tf                       tf2_msgs/TFMessage           world -> CAMERA, CAMERA -> CAMERA_depth; axes as OpenCV's
     /decisions, /scores       std_msgs/String              JSON
 
-Frames are the cameras' ids; in topics, what ROS does not allow becomes an underscore, and camera_ goes before a digit.
+Frames are the cameras' ids; topics replace what ROS does not allow by an underscore and put camera_ before a digit.
 A message's time in the bag is its arrival at the edge, its stamp the capture, both on the edge's clock.
 """
 
@@ -39,7 +39,7 @@ except ImportError:
 _VERSION: Literal[9] = 9  # of the bag's metadata: ROS 2 Jazzy
 _VIEWED = ("jpeg", "png")
 _MILLIMETER = 0.001
-_NOT_A_ROS_NAME = re.compile(r"[^A-Za-z0-9]+")  # repeated underscores are none either
+_NOT_A_ROS_NAME = re.compile(r"[^A-Za-z0-9]+")  # repeated underscores are not allowed either
 
 
 class BagWriter:
@@ -104,7 +104,7 @@ class BagWriter:
             self._bag.abort()
 
     def _name(self, camera: str) -> str:
-        """The camera's own name in topics, which begins with no digit: ROS 2 allows no such topic."""
+        """The camera's unique name in topics. It does not begin with a digit, which ROS 2 does not allow."""
         if camera not in self._names:
             allowed = re.sub(r"^(?=\d)", "camera_", _NOT_A_ROS_NAME.sub("_", camera))
             names = (allowed, *(f"{allowed}_{k}" for k in range(2, len(self._names) + 3)))
@@ -150,6 +150,6 @@ class BagWriter:
 
 def _measured(depth: DepthImage) -> tuple[str, np.ndarray]:
     """Encoding and values of a depth image in ROS's convention (REP 118)."""
-    if math.isclose(depth.meters_per_count, _MILLIMETER, rel_tol=1e-6):  # librealsense tells it in 32 bits
+    if math.isclose(depth.meters_per_count, _MILLIMETER, rel_tol=1e-6):  # librealsense reports a 32-bit float
         return "16UC1", depth.counts.astype("<u2")
     return "32FC1", np.where(depth.counts > 0, depth.meters(), np.nan).astype("<f4")

@@ -49,7 +49,7 @@ class _Location(NamedTuple):
 class SessionFrame:
     """A recorded frame whose payload is still in the file.
 
-    arrived_ns: arrival on the edge's clock. depth_location: None: it brought no depth.
+    arrived_ns: arrival on the edge's clock. depth_location: None if the frame has no depth.
     """
 
     header: pb.FrameHeader
@@ -64,7 +64,7 @@ class Session:
     frames: by camera, in the order of arrival.
     messages: number of complete messages by topic.
     cut: one line on what is missing if the file was not closed or is damaged; else None.
-    Raises SessionError if it is no MCAP file, OSError if it cannot be read.
+    Raises SessionError if it is not an MCAP file, OSError if it cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -81,7 +81,7 @@ class Session:
         self._size = os.fstat(self._file.fileno()).st_size
         self._compressed = 0
         if self._file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise SessionError(f"{path}: is no MCAP file")
+            raise SessionError(f"{path}: is not an MCAP file")
         end = self._read_all()
         parts = []
         if end is not None:
@@ -99,7 +99,7 @@ class Session:
         return bytes(self._read_again(CompressedImage, frame.location).data)
 
     def depth(self, frame: SessionFrame) -> EncodedDepth | None:
-        """The depth of one of ``frames``, as it came; None: it brought none. Raises as ``payload``."""
+        """The depth of one of ``frames``, as received; None if it has none. Raises as ``payload``."""
         return None if frame.depth_location is None else depth_of(self._read_again(pb.Depth, frame.depth_location))
 
     def _read_again(self, kind: type[Any], location: _Location) -> Any:

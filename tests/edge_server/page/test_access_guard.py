@@ -161,7 +161,7 @@ def test_the_page_says_in_words_what_is_open() -> None:
         assert ask(page.port)[0] == 200  # without a login
         messages = page._server._websock_server._broadcast_buffer.message_from_id.values()
         texts = [m.props.content for m in messages if type(m).__name__ == "GuiHtmlMessage"]
-    assert any("Insecure: page on 0.0.0.0" in text and "nobody is asked" in text for text in texts)
+    assert any("Insecure: page on 0.0.0.0" in text and "callers are not authenticated" in text for text in texts)
 
 
 def test_a_foreign_web_site_reaches_nothing() -> None:
