@@ -23,9 +23,9 @@ from freshfield.scenario import Scenario
 
 log = logging.getLogger("camera-node")
 
-# 2^32 by the golden ratio: shot k has depth where k * _DEPTH_STEP mod 2^32 is below 2^32 / depth_every. That is one in
-# depth_every shots, spread evenly (each fifth: 3, 5 or 8 apart), and also one in depth_every of each second, third, ...
-# shot: a link that takes exactly so many captures a frame would never get depth if it came with each so many-th.
+# 2^32 by the golden ratio: shot k has depth if k * _DEPTH_STEP mod 2^32 is below 2^32 / depth_every. That is one in
+# depth_every shots, spread evenly (for 5: 3, 5 or 8 apart), and also one in depth_every of every second, third, ...
+# shot. With a fixed stride, a link that takes every n-th capture could miss all shots with depth.
 _DEPTH_STEP = 0x9E3779B9
 
 
@@ -60,10 +60,10 @@ class Camera:
     waits: whether a capture may wait for hardware.
 
     config: gives codec and quality. cache: shared by the process's cameras.
-    clock_error: makes the camera's clock wrong; None: it is right.
-    depth_every: of so many shots of the source one is sent with its depth, where it has any; 0: none.
+    clock_error: error of the camera's clock; None: the clock is exact.
+    depth_every: one in this many shots is sent with its depth, if the source has any; 0: none.
 
-    depth_failed: number of shots made whose depth could not be made or sent, and which go without.
+    depth_failed: number of shots that have no depth because it could not be made or sent.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Camera:
         self.fps = source.fps
         self.source = source
         self.codec = source.recorded_codec or config.codec
-        # A camera that waits for a device or an arm must not keep others waiting.
+        # A camera that waits for a device or an arm must not delay the others.
         arm = getattr(config, "arm", None)
         self.waits = config.waits or (arm is not None and source.camera in arm.cameras)
         self._quality = config.quality
@@ -88,7 +88,7 @@ class Camera:
         self.depth_failed = 0
 
     def clock(self, true: Clock) -> NodeClock:
-        """The clock with which this camera stamps frames. true: tells the true time."""
+        """The clock with which this camera stamps frames. true: a clock without error."""
         return NodeClock(true, self._clock_error)
 
     def cached(self, tick: int) -> Shot | None:
@@ -135,7 +135,7 @@ class Camera:
             shot = self.source.read(content)
         except (ValueError, OSError):
             raise
-        except Exception as error:  # a source from outside raises anything: that costs this shot
+        except Exception as error:  # a plug-in source may raise anything: only this shot is lost
             raise ValueError(repr(error)) from error
         data = shot.image
         if not isinstance(data, bytes):
@@ -145,16 +145,16 @@ class Camera:
         return replace(shot, image=data, depth=None, encoded_depth=depth)
 
     def _depth_to_send(self, content: int, shot: Shot, image_bytes: int) -> EncodedDepth | None:
-        """The shot's depth; None where it brings none, or only such as cannot be sent: that costs the depth alone, is
+        """The shot's depth; None if it has none, or if it cannot be sent. The image is then sent alone; the failure is
         counted, and logged the first time."""
         try:
             depth = self._encode_depth(content, shot)
             if depth is not None:
                 depth.check(shot.intrinsics, image_bytes)
-        except Exception as error:  # a source from outside raises anything
+        except Exception as error:  # a plug-in source may raise anything
             if not self.depth_failed:
                 why = error if isinstance(error, ValueError | OSError) else repr(error)
-                log.warning("%s: a frame without its depth: %s (further ones are only counted)", self.name, why)
+                log.warning("%s: frame sent without depth: %s (further ones are only counted)", self.name, why)
             self.depth_failed += 1
             return None
         return depth

@@ -55,15 +55,15 @@ class RateSchedule:
 
 
 class PartialSchedule(RateSchedule):
-    """Of every ``every`` ticks all but the first, which are numbered without a gap: those of a camera that is carried
-    about, some of whose captures are held out."""
+    """All but the first of every ``every`` ticks, renumbered without gaps: the training captures of a moving camera
+    some of whose captures are held out."""
 
     def __init__(self, fps: Fraction, phase_ns: int, every: int) -> None:
         super().__init__(fps, phase_ns)
         self._every = every
 
     def whole(self, tick: int) -> int:
-        """The number of a tick among all of them."""
+        """The number of a tick among all ticks of the rate."""
         return tick + tick // (self._every - 1) + 1
 
     def due_ns(self, tick: int) -> int:

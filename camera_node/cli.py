@@ -56,7 +56,7 @@ def main(arguments: list[str] | None = None, prog: str = "camera-node") -> int:
         "devices",
         help="list the cameras that are plugged in",
         description="Lists the cameras that are plugged in: the kind of source, and what to write as source.devices. "
-        "Videos of fixed cameras take their place by: freshfield scenario init FILE.yaml --like videos",
+        "To use videos of fixed cameras instead: freshfield scenario init FILE.yaml --like videos",
     )
     devices.set_defaults(run=_devices)
     arm_cli.add_commands(commands)
@@ -79,13 +79,13 @@ def _add_run(commands: Any) -> None:
     add("--camera-index", type=int, metavar="N", help="the camera of this number in the scenario, from 0 (of a pod)")
     add("--all", action="store_true", help="all cameras of the scenario")
     names = (
-        "in place of a scenario, play a recording or data set: as camera ID, which in the recording is NAME "
-        "[the only one]; none is held out: that takes a scenario with cameras.held_out (docs/data.md)"
+        "play a recording or data set instead of a scenario: its camera NAME [the only one] as camera ID; "
+        "no camera is held out: use a scenario with cameras.held_out for that (docs/data.md)"
     )
     add("--as", dest="names", metavar="ID[=NAME][,...]", help=names)
     add = run.add_argument
     add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
-    add("--seed", type=int, metavar="N", help="random seed, in place of the scenario's")
+    add("--seed", type=int, metavar="N", help="random seed, instead of the scenario's")
     add("--to", required=True, metavar="HOST:PORT", help="address of the channel emulator or edge server")
     add("--out", type=out_folder, metavar="DIR", help="folder to write the ledger and status file to [not written]")
     add("--seconds", type=float, metavar="S", help="end after S seconds of capture [on Ctrl-C]")
@@ -108,7 +108,7 @@ def _add_doctor(commands: Any) -> None:
     add("--data", type=Path, metavar="DIR", help="folder of recorded data sets [$FRESHFIELD_DATA]")
     runs = "folder that runs will be written to [%(default)s]"
     add("--out", type=Path, default=Path("runs"), metavar="DIR", help=runs)
-    plan = "draw what fixed cameras see, and where one more helps most"
+    plan = "draw the coverage of fixed cameras, and where one more helps most"
     add("--plan", type=Path, metavar="FILE.svg", help=plan)
     add("--json", action="store_true", help="print the result as one JSON object")
     transport.add_arguments(doctor, listens=False)

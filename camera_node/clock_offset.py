@@ -34,7 +34,7 @@ class OffsetEstimator:
     """NTP's estimate: the offset of the exchange with the smallest error bound among the last ``KEPT_OFFSETS``.
 
     The bound is half the round trip plus ``drift_ppm`` (parts per million) of the exchange's age, so the
-    estimate follows a drifting clock. An exchange that contradicts it ends those before. Thread-safe.
+    estimate follows a drifting clock. An exchange that contradicts it discards the earlier ones. Thread-safe.
     """
 
     def __init__(self, drift_ppm: float = tuned.OFFSET_DRIFT_PPM) -> None:
@@ -76,7 +76,7 @@ class OffsetEstimator:
 
 
 class ClockSync:
-    """Measures the peer's clock minus ``clock`` as long as ``run`` runs.
+    """Measures the peer's clock minus ``clock`` while ``run`` is running.
 
     channel, metadata: of the calls to the peer.
     """

@@ -10,7 +10,7 @@ from freshfield.clock import Clock
 
 
 class ClockError(Protocol):
-    """The error of a camera's clock, as its effects make it."""
+    """The clock error that a camera's effects produce."""
 
     def node_ns(self, true_ns: int) -> int:
         """What the wrong clock shows at a true time."""

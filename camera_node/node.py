@@ -72,7 +72,7 @@ class Node:
         self._trouble: dict[str, Counter[str]] = {c.name: Counter() for c in cameras}
         self._syncs: dict[str, ClockSync] = {}
         self._stopping = asyncio.Event()
-        # What computes shares a thread; each camera that waits has one of its own, so that dead ones cost only theirs.
+        # Cameras that compute share a thread; each that waits for hardware has its own, so a dead one blocks no other.
         self._pool = ThreadPoolExecutor(1, thread_name_prefix="capture")
         self._own_pools = {
             c.name: ThreadPoolExecutor(1, thread_name_prefix=f"capture {c.name}") for c in cameras if c.waits
@@ -228,7 +228,7 @@ class Node:
             pass  # those frames are recorded as broken
 
     def failure(self) -> str | None:
-        """After ``run``: why no frame was taken; None if one was, or there was no time for any."""
+        """After ``run``: why the peer took no frame; None if it took one, or there was no time for any."""
         counts = sum((outbox.counts for outbox in self.outboxes.values()), Counter())
         failed = sum(trouble["failed"] for trouble in self._trouble.values())
         if failed and not counts["captured"]:
@@ -267,8 +267,8 @@ class Node:
         and clock_uncertainty_ms (peer minus camera; null before the first exchange), the numbers of frames
         waiting, captured, replaced, sent and broken, outcomes {accepted, dropped_busy, superseded,
         "rejected:<reason>"}, missed (ticks for which the machine was too slow), failed (shots that could not
-        be made), depth_failed (shots made that had to do without their depth; a shot that repeats counts once),
-        poses_refused (lines of a tracker that are no pose).
+        be made), depth_failed (shots sent without depth because it failed; a repeating shot counts once),
+        poses_refused (lines of a tracker's file that are not poses).
         """
         return {
             "name": self.name,

@@ -49,7 +49,7 @@ class Sender:
     metadata: of the calls.
     offset: returns the current estimate of the peer's clock minus the camera's, which each frame carries.
     jitter: random generator for the pauses between attempts.
-    troubles: camera to what is wrong, of all senders of a node: what one has said, the others do not repeat.
+    troubles: current problem by camera, shared by the senders of a node so that each problem is logged once.
     response_timeout_s: the stream counts as dead if an answer takes longer than this, or much longer than the
         recent ones. After each such timeout the allowed time is doubled, up to this one.
     """
@@ -154,7 +154,7 @@ class Sender:
             if response is grpc.aio.EOF:
                 raise await _status(call)
             if response is None:  # gRPC's result for bytes that are no PushResponse
-                raise ProtocolError("the answer is no PushResponse")
+                raise ProtocolError("the answer is not a PushResponse")
             if response.sequence != frame.sequence:
                 raise ProtocolError(f"answer to frame {response.sequence}, expected {frame.sequence}")
             answered = True
@@ -187,13 +187,13 @@ class Sender:
         self.outbox.record(frame.sequence, "answered", outcome)
 
     def _answered(self) -> None:
-        """Forget what was wrong, and say so once no other camera of the node has the same trouble."""
+        """Clear the problem, and log so once no other camera of the node has the same one."""
         trouble = self._troubles.pop(self.outbox.camera, "")
         if trouble and trouble not in self._troubles.values():
             log.info("%s: connected again", self.outbox.camera)
 
     def _report(self, error: Exception) -> None:
-        """Log what failed, once per kind of trouble: not once per attempt, nor once per camera of a node."""
+        """Log a failure once per kind, not once per attempt or per camera of a node."""
         if isinstance(error, grpc.aio.AioRpcError):
             text = f"{error.code().name}: {peer_text(error.details())}"
         else:

@@ -1,6 +1,6 @@
 """The scenario's ``source:`` section: what the cameras see, their frame rate, and how frames are compressed.
 
-``kind`` chooses the struct in ``MODELS``, or a class from outside (``own_class``), whose docstring and keys
+``kind`` chooses the struct in ``MODELS``, or a plug-in class (``own_class``), whose docstring and keys
 ``freshfield scenario keys source`` prints. All keys are checked here, with file and key in the message. Checks that
 need the data itself (does the folder hold this camera?) are made when the source opens.
 """
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 
 Background = Literal["white", "black", "keep"]
 FPS_RANGE = (0.01, 1000.0)
-"""Bounds of a rate of captures or of a recording, frames a second."""
+"""Bounds of a capture or recording rate, frames a second."""
 # Captures a second where a scenario gives no rate: of a synthetic world, of a device, of photos without times.
 WORLD_FPS, LIVE_FPS, PHOTO_FPS = 15.0, 15.0, 10.0
 FIRST_FRAME_S = 3.0
-"""How long the first frame of a camera may take, where a scenario says nothing of it."""
+"""Default of the longest wait for a camera's first frame."""
 
 ZJU_FPS = 50.0
-"""Assumed rate of ZJU-MoCap's studio, which its files do not tell."""
+"""Assumed frame rate of ZJU-MoCap, which its files do not state."""
 MAX_LATENCY_MS = 6e4
 """Longest latency of a camera: one that is a minute late is not live."""
 
@@ -50,8 +50,8 @@ class SourceConfig(Settings, frozen=True, kw_only=True):
     fps: Annotated[float, within(*FPS_RANGE, "captures per second")] | None = None
     codec: Literal["jpeg", "png", "zstd"] = DEFAULT_CODEC
     quality: Annotated[int, within(1, 100, "of JPEG; from 90 up, color is not subsampled")] = 92
-    # Depth takes about as many bytes as its image: so it adds a sixth to them, and of 15 frames a second three measure.
-    depth_every: Annotated[int, within(0, 10**6, "of so many frames of a depth camera one brings depth; 0: none")] = 5
+    # Depth takes about as many bytes as its image: with 5 it is a sixth of all bytes, in 3 of 15 frames a second.
+    depth_every: Annotated[int, within(0, 10**6, "one in this many frames of a depth camera has depth; 0: none")] = 5
     effects: dict[str, dict[str, Any] | None] = field(default_factory=dict)
 
     waits: ClassVar[bool] = False  # whether captures wait for hardware: in threads of their own, never in virtual time
@@ -80,12 +80,12 @@ class WorldConfig(SourceConfig, frozen=True, kw_only=True):
 
 
 class TrajectoryConfig(Settings, frozen=True):
-    """Poses from TUM files (``t tx ty tz qx qy qz qw``), one a camera, instead of the calibration's. Of real cameras
-    a tracker writes them while the camera runs, or writes to named pipes: seconds since 1970.
+    """Poses from TUM files (``t tx ty tz qx qy qz qw``), one per camera, instead of the calibration's. With real
+    cameras, a tracker writes the files, or named pipes, while they run; t is in seconds since 1970.
 
     max_gap_ms: a frame farther than this from its pose sample is not sent.
-    hand_eye: the files are of the flange that holds the camera, and this one, of ``camera-node calibrate hand-eye
-    --out``, says where.
+    hand_eye: output of ``camera-node calibrate hand-eye --out``: the camera's pose on the flange, whose poses the
+    files then hold.
     """
 
     files: Annotated[dict[str, str], about("camera -> file")]
@@ -119,8 +119,8 @@ class TransformsConfig(RecordedConfig, frozen=True, kw_only=True):
 
 
 class VideoConfig(RecordedConfig, frozen=True, kw_only=True):
-    """Video files with a calibration JSON. data: the JSON, or the folder that holds it; or one camera's video, whose
-    lens ``horizontal_fov_deg`` tells. files: not given, they are ``videos/<camera>.mp4`` or ``<camera>.mp4``.
+    """Video files with a calibration JSON. data: the JSON or its folder; or one camera's video, whose lens
+    ``horizontal_fov_deg`` gives. files: not given, they are ``videos/<camera>.mp4`` or ``<camera>.mp4``.
     """
 
     files: Annotated[dict[str, str], about("camera -> video, relative to the JSON")] = field(default_factory=dict)
@@ -133,7 +133,7 @@ class LiveConfig(SourceConfig, frozen=True, kw_only=True):
 
     devices: serial numbers; for kind ``camera`` a number, path or address (``camera-node devices``). Needed if there is
         more than one.
-    calibration: relative to the scenario; not given: intrinsics are the device's own, if it has any, and poses come
+    calibration: relative to the scenario; not given: intrinsics are the device's, if it reports any, and poses come
     from ``arm`` or ``trajectory``, whose files are relative to the scenario, too.
     """
 
@@ -161,8 +161,8 @@ class CameraConfig(LiveConfig, frozen=True, kw_only=True):
 
 
 class OakConfig(LiveConfig, frozen=True, kw_only=True):
-    """Luxonis OAK cameras through depthai 3 (extra ``oak``). The device straightens the picture, and measures depth
-    if it has a stereo pair.
+    """Luxonis OAK cameras through depthai 3 (extra ``oak``). The device undistorts the image, and measures depth if it
+    has a stereo pair.
     """
 
     socket: Annotated[str, about("which of the device's cameras")] = "CAM_A"
@@ -182,13 +182,13 @@ class ZjuConfig(RecordedConfig, frozen=True, kw_only=True):
     """ZJU-MoCap. data: the folder with ``annots.npy`` and the cameras' folders of images. background: what goes
     behind the person."""
 
-    recorded_fps: Annotated[float, within(*FPS_RANGE, "of the recording, whose files do not tell")] = ZJU_FPS
+    recorded_fps: Annotated[float, within(*FPS_RANGE, "of the recording, whose files do not state it")] = ZJU_FPS
     masks: Annotated[str | None, about("a folder of masks (mask_cihp) that cut the person out")] = None
     background: Background = "black"
 
 
 class EyefulConfig(RecordedConfig, frozen=True, kw_only=True):
-    """Eyeful Tower. data: a scene's folder with ``cameras.json``. Cameras are called as their folders: name them
+    """Eyeful Tower. data: a scene's folder with ``cameras.json``. Cameras are named like their folders: list them
     in cameras.ids, or in assignment. images: not given, it is the smallest of ``images-jpeg-1k``, ``-2k``, ``-4k``,
     ``images-jpeg``.
     """
@@ -215,13 +215,13 @@ class FoxgloveConfig(RecordedConfig, frozen=True, kw_only=True):
 
 class RosbagConfig(RecordedConfig, frozen=True, kw_only=True):
     """A ROS bag, read without ROS (extra ``ros``). data: a ROS 2 bag's folder, its one .mcap or .db3 file, or a ROS 1
-    .bag. Cameras are called as their frames (``frame_id``): name them in cameras.ids, or in assignment."""
+    .bag. Cameras are named like their frames (``frame_id``): list them in cameras.ids, or in assignment."""
 
 
 class McapConfig(SourceConfig, frozen=True, kw_only=True):
     """A session that ``edge-server run --record`` wrote, replayed message by message: the same bytes and
-    poses, stamps shifted to now, from first to last, after which the node ends. fps, codec, quality and depth are
-    the recording's own."""
+    poses, with stamps shifted to now, once through, after which the node ends. fps, codec, quality and depth are
+    the recording's."""
 
     file: Annotated[str, about("the recording")] = ""
     assignment: Annotated[dict[str, str], about("scenario camera -> the recording's")] = field(default_factory=dict)
@@ -280,14 +280,14 @@ def source_config(scenario: Scenario) -> SourceConfig:
                 raise ScenarioError(f"{where}.{key}.{unknown[0]}: not a camera of this scenario")
     if scenario.phase != "locked" and not isinstance(config, WorldConfig):
         raise ScenarioError(
-            f"{scenario.path}: cameras.phase: {scenario.phase} is for source.kind world alone, others capture when "
-            "they can: remove phase"
+            f"{scenario.path}: cameras.phase: {scenario.phase} applies to source.kind world only, others capture at "
+            "their own times: remove phase"
         )
     return config
 
 
 def own_class(kind: str) -> tuple[type[Source], type[SourceConfig]]:
-    """The class of a source from outside (``freshfield.plugins``), and its keys. Raises PluginError."""
+    """The class of a plug-in source (``freshfield.plugins``), and its keys. Raises PluginError."""
     from camera_node.sources.base import Source
 
     found: type[Source] = plugins.find("source", kind, MODELS)

@@ -1,4 +1,4 @@
-"""A bad network for your own tests: the pytest fixture ``channel``.
+"""The pytest fixture ``channel``: a bad network for your tests.
 
 It needs only pytest besides freshfield (``pip install freshfield[test]``), which finds the fixture by itself. Where
 freshfield is only on the path, write ``pytest_plugins = ["channel_emu.testing"]`` in the ``conftest.py`` at the root of

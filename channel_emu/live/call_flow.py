@@ -37,7 +37,7 @@ class CallFlow:
         self._messages: deque[Message] = deque()
         self._read = 0
         self._dropped = 0
-        self._due_ns = 0  # of the message that was decided last, of those passed on or left out
+        self._due_ns = 0  # of the latest message that was passed on or dropped
         self._ended = False
         self._wake = asyncio.Event()
         self._not_full = asyncio.Event()
@@ -79,7 +79,7 @@ class CallFlow:
         self._wake.set()
 
     def close(self) -> None:
-        """End the flow, as the call is over: until then, a reset of the link ends it, whichever way still carries."""
+        """End the flow when the call is over. Until then a link reset ends the call, even if this direction is done."""
         self._stop()
         if self._link is not None:
             self._link.calls.discard(self._call)

@@ -141,7 +141,7 @@ class CameraStream:
                 # The stream itself may still be open, and then asking for its status would wait for ever.
                 error = task.exception()
                 if isinstance(error, DecodeError):
-                    self._log_trouble("the edge sent what is no answer to a frame")
+                    self._log_trouble("the edge sent a message that is not an answer")
                     return False
                 if error is not None and not isinstance(error, STREAM_ENDED):
                     raise error
@@ -212,7 +212,7 @@ class CameraStream:
     def _hand_on(self, frame: Message) -> None:
         now_ns = self._clock.now_ns()
         self._record(frame, "forwarded", now_ns)
-        if frame.handed_on:  # the second copy is no further frame
+        if frame.handed_on:  # the second copy does not count as another frame
             return
         frame.handed_on = True
         self.forwarded += 1

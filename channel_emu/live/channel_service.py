@@ -24,8 +24,8 @@ class ChannelService(channel_pb2_grpc.ChannelServiceServicer):
     def __init__(self, proxy: Proxy) -> None:
         self._proxy = proxy
         self.changes: deque[dict[str, Any]] = deque(maxlen=MAX_CHANNEL_CHANGES)
-        """Oldest first: {at_ns: on the emulator's clock, delay_ms, loss}; the latter two are None where the
-        scenario's channel came back."""
+        """Oldest first: {at_ns: on the emulator's clock, delay_ms, loss}; the latter two are None if the scenario's
+        channel was restored."""
 
     async def SetChannel(
         self, request: channel_pb2.SetChannelRequest, context: grpc.aio.ServicerContext
@@ -35,7 +35,7 @@ class ChannelService(channel_pb2_grpc.ChannelServiceServicer):
         code, problem = grpc.StatusCode.INVALID_ARGUMENT, ""
         if proxy.options.replay is not None:
             code = grpc.StatusCode.FAILED_PRECONDITION
-            problem = "the emulator repeats a recorded trace, which decides: start it without --replay"
+            problem = "the emulator replays a recorded trace, which fixes delays and losses: start it without --replay"
         elif not 0.0 <= delay_ms <= MAX_SET_DELAY_MS:
             problem = f"expected a delay of 0 to {MAX_SET_DELAY_MS:g} ms, got {delay_ms:g} ms"
         elif not 0.0 <= loss <= 1.0:

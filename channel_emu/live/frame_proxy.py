@@ -77,7 +77,7 @@ class FrameProxy(Proxy):
         self._control = ChannelService(self)
         if changes := read_status(out / "channel.json").get("changes"):  # of an earlier process
             self._control.changes.extend(changes)
-            if changes[-1].get("loss") is not None:  # it ended with that process
+            if changes[-1].get("loss") is not None:  # that change ended with its process
                 self._control.changes.append({"at_ns": self.origin_ns, "delay_ms": None, "loss": None})
         self._handlers = {
             PUSH: grpc.stream_stream_rpc_method_handler(self._push),
@@ -99,7 +99,7 @@ class FrameProxy(Proxy):
             async with asyncio.timeout(tuned.FIRST_WAIT_S):
                 for flow in self.flows.values():
                     await flow.opened.wait()
-        # Scanning old objects makes the garbage collector's long pauses, and nearly all of them exist by now.
+        # The garbage collector's long pauses come from scanning old objects, nearly all of which exist by now.
         gc.collect()
         gc.freeze()
 
@@ -108,7 +108,7 @@ class FrameProxy(Proxy):
         if self._warn_at_ns and self.clock.now_ns() > self._warn_at_ns:
             self._warn_at_ns = 0
             if not any(flow.connected for flow in self.flows.values()):
-                log.warning("no answer from the edge at %s yet; frames are broken until it is there", self.options.to)
+                log.warning("no answer from the edge at %s yet; frames are broken until it answers", self.options.to)
         await asyncio.to_thread(self._write_status, self._snapshot())
 
     def close(self) -> None:
@@ -170,7 +170,7 @@ class FrameProxy(Proxy):
         except FrameRejected as error:
             return self._reject(header, error.reason, str(error)), flow
         if not flow.link.has_room(raw):
-            return self._reject(header, "queue_full", "the emulator holds as many bytes as it may"), flow
+            return self._reject(header, "queue_full", "the emulator's queue has reached its limit of bytes"), flow
         call.use()
         try:
             return flow.take(raw, header), flow

@@ -1,4 +1,4 @@
-"""Numbers of the live emulator that somebody may want to change."""
+"""Constants of the live emulator that somebody may want to change."""
 
 # --- calls and their messages (proxy, call_flow) ---
 MOST_CALLS = 1000  # open at once through ``channel-emu proxy``; each takes 30 kB
@@ -25,10 +25,10 @@ EXCHANGE_TIMEOUT_S = 5.0  # longest duration of a clock exchange that is passed 
 MAX_SET_DELAY_MS = 10_000.0  # mean delay that may be set: with more, a run would show nothing but its own start
 MAX_CHANNEL_CHANGES = 256  # that the status keeps, which is written twice a second; older ones are in the log
 
-# --- the end, the status and the past of the emulator (proxy, histogram) ---
+# --- shutdown, status and history of the emulator (proxy, histogram) ---
 STOP_GRACE_S = 0.5  # for open calls to end when the emulator stops
-REFRESH_EVERY_S = 0.5  # time between two writings of the status
-SETTLED_POLL_S = 0.002  # between two looks at whether no message is inside a link
+REFRESH_EVERY_S = 0.5  # time between two writes of the status
+SETTLED_POLL_S = 0.002  # polling interval of the wait until no message is inside a link
 DRAWN_BINS, DRAWN_PERCENT = 50, 99.5  # of a histogram that is drawn: equal bins, up to this percentile
 KEEP_PATH_NS = 60 * 10**9  # how much of the chain's past path is kept; no event is processed later than this
 

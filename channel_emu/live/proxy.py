@@ -174,7 +174,7 @@ class Proxy(grpc.GenericRpcHandler):
             return
         kind = "" if isinstance(failure, OSError) else f"{type(failure).__name__}: "
         hint = "; is there room on the disk?" if isinstance(failure, OSError) else ""
-        raise EmulatorFailed(f"stopped, it could not go on: {kind}{failure}{hint}") from failure
+        raise EmulatorFailed(f"stopped because of an error: {kind}{failure}{hint}") from failure
 
     async def settled(self) -> None:
         """Wait until no message is inside a link or being handed on. Raises EmulatorFailed."""
@@ -209,7 +209,7 @@ class Proxy(grpc.GenericRpcHandler):
         else:
             model = self.channel.link(name)
             if self.options.replay is not None:
-                log.info("%s: not in the replayed trace (held out?); its link decides anew", name)
+                log.info("%s: not in the replayed trace (held out?); its link makes new decisions", name)
         link = self.links[name] = LiveLink(
             name, model, self.events, DelayStats(self.stats), damage or _damage_any_byte, self._trace, self._budget
         )

@@ -68,7 +68,7 @@ class ReplayLink(Link):
         record, shift = self._record_of(transit)
         if record.outcome is not None and record.ended_ns is not None:
             return EventKind(record.outcome), record.ended_ns + shift
-        # The recording ended before. The due instant was recorded if transmission had started.
+        # The recording ended before the outcome. The due instant was recorded if transmission had started.
         if record.due_ns is None:
             return EventKind.SUPERSEDED, transit.offered_ns
         return EventKind.DELIVERED, record.due_ns + shift

@@ -1,9 +1,8 @@
-"""A proxy for any protocol over TCP: what is sent passes the emulated link in pieces, in order and without loss.
+"""A proxy for any protocol over TCP: bytes pass the emulated link in pieces, in order and without loss.
 
-TCP repairs what a network does, so here losses cost time: a piece that the link loses or damages is sent again after a
-timeout, and what came after it waits. Each direction has one link, of discipline fcfs, for all connections: they share
-its capacity. A sender is read no further than PIECES_BEHIND pieces ahead of what has arrived, as a receiver's window
-does it.
+TCP retransmits, so losses cost time: a piece that the link loses or damages is sent again after a timeout, and later
+ones wait for it. Each direction has one link, of discipline fcfs, for all connections, which share its capacity. The
+proxy reads a sender at most PIECES_BEHIND pieces ahead of what has arrived, like a TCP receive window.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ class Connection:
         """Connections are not ended for lack of use."""
 
     def end(self, *_: Any) -> None:
-        """Break the connection: both sides see a reset, because an end would look as if nothing were missing."""
+        """Break the connection: both sides see a reset, since a normal close would look as if nothing were missing."""
         for writer in self._writers:
             with contextlib.suppress(OSError):  # closed already
                 writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET_AT_CLOSE)
@@ -55,7 +54,7 @@ class Pipe(CallFlow):
     most_ready = most_behind = tuned.PIECES_BEHIND
 
     def settle(self, message: Message, kind: EventKind) -> None:
-        """What is lost or damaged is offered again after a while, and a copy is discarded, as TCP does it."""
+        """Offer a lost or damaged piece again after a while, and discard a copy, as TCP does."""
         damaged = message.transit is not None and bool(message.transit.flips)
         if kind is EventKind.DUPLICATED or (kind is EventKind.DELIVERED and not damaged):
             message.duplicated = False
@@ -92,7 +91,7 @@ class Pipe(CallFlow):
 
 
 class TcpProxy(Proxy):
-    """As ``Proxy``, for bytes instead of calls. TLS passes as it is: certificates and tokens are not used."""
+    """As ``Proxy``, for bytes instead of calls. TLS passes through unchanged: certificates and tokens are not used."""
 
     def __init__(self, config: ChannelConfig, seed: int, options: ProxyOptions) -> None:
         super().__init__(replace(config, discipline="fcfs"), seed, options)
@@ -119,7 +118,7 @@ class TcpProxy(Proxy):
         return self.port
 
     def link(self, name: str, damage: Callable[[bytes, Flips], bytes] | None = None) -> LiveLink:
-        """See ``Proxy``. What was damaged is sent again as it was: checksums find it."""
+        """See ``Proxy``. Damaged pieces are sent again undamaged, because TCP's checksums detect damage."""
         return super().link(name, damage or (lambda raw, flips: raw))
 
     def close(self) -> None:
@@ -173,14 +172,14 @@ class TcpProxy(Proxy):
             down.close()
             for part in parts:
                 part.cancel()
-            if any(await asyncio.gather(*parts, return_exceptions=True)):  # not both came to their end
+            if any(await asyncio.gather(*parts, return_exceptions=True)):  # at least one failed
                 both.end()
             back.transport.abort()
 
 
 @contextlib.contextmanager
 def _as_reset() -> Iterator[None]:
-    """A peer that no longer answers, or to which no way leads, has broken its connection alone."""
+    """Treat a peer that no longer answers or is unreachable as a reset of its connection only."""
     try:
         yield
     except OSError as error:

@@ -48,6 +48,6 @@ class RunningAge:
 
 
 def mean_of_known(values: list[float | None]) -> float | None:
-    """Mean of the values that are not None, one a camera or link; None if there are none."""
+    """Mean of the values that are not None, one per camera or link; None if there are none."""
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else None

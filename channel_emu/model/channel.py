@@ -24,7 +24,7 @@ class Channel:
         self.chain = self._chain("") if config.chain is not None and config.chain.scope == "shared" else None
         self._server = QueueServer(config.queue_limit) if config.server.shared else None
         self.by_hand: tuple[float, float] | None = None
-        """Mean delay (ms) and loss that an operator has set; None: the channel is the scenario's."""
+        """Mean delay (ms) and loss that an operator has set; None: the scenario's channel applies."""
         self._in_force = config
 
     def chain_of(self, camera: str) -> Chain | None:
@@ -50,7 +50,7 @@ class Channel:
         )
 
     def set_by_hand(self, delay_ms: float, loss: float) -> None:
-        """Let links that ``change`` have these delays and losses in place of the scenario's channel.
+        """Give links, once they ``change``, these delays and losses instead of the scenario's channel.
 
         delay_ms: mean; the distribution's shape stays (none: every delay is the mean). loss: probability.
         Frames enter as they are offered, and all other faults are off. Chain, discipline and server stay.
@@ -70,7 +70,7 @@ class Channel:
         self.by_hand, self._in_force = None, self.config
 
     def change(self, link: Link, at_ns: int) -> list[Event]:
-        """Bring a link to what is in force, from ``at_ns`` on. Returns its events up to then."""
+        """Apply the current channel to a link from ``at_ns`` on. Returns its events up to then."""
         return link.change(
             at_ns,
             self.service(link.camera, link.chain),

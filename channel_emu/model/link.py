@@ -83,7 +83,7 @@ class Event:
 
 
 class Fault:
-    """Base class of the faults; as it stands, it changes nothing."""
+    """Base class of the faults; it changes nothing itself."""
 
     by_size: ClassVar[bool] = False
     """Whether the fault depends on the size of a frame."""
@@ -214,7 +214,7 @@ class Link:
     def change(
         self, at_ns: int, service: ServiceTime, arrivals: PoissonArrivals | None, faults: Sequence[Fault]
     ) -> list[Event]:
-        """Process the events up to ``at_ns``; from then on, draw delays, arrivals and faults from these. Returns the
+        """Process the events up to ``at_ns``; from then on, use these service times, arrivals and faults. Returns the
         events in order.
 
         Frames in service keep their due instants; the new faults decide whether they arrive.
@@ -225,7 +225,7 @@ class Link:
         self._next_reset_ns = min((f.next_reset_ns(at_ns) for f in self._faults), default=NEVER_NS)
         waiting, self._unsampled, self._sample_ns = self._unsampled, None, NEVER_NS
         self._update_next_event()
-        if waiting is not None:  # its sampling instant was of the arrivals before
+        if waiting is not None:  # its sampling instant came from the previous arrival process
             self._arrive(waiting, at_ns)
         return self._take_events()
 

@@ -205,7 +205,7 @@ def channel_from_mapping(
     faults = _read_faults(merged.pop("faults", None) or {}, f"{where}.faults")
     if strange := [name for name in getattr(faults.get("blackout"), "cameras", ()) if cameras and name not in cameras]:
         raise ScenarioError(
-            f"{where}.faults.blackout.cameras: {strange[0]!r} is none of the scenario's: {', '.join(cameras)}"
+            f"{where}.faults.blackout.cameras: {strange[0]!r} is not one of the scenario's: {', '.join(cameras)}"
         )
     config = read_settings(ChannelConfig, merged, where)
     try:

@@ -1,5 +1,5 @@
-"""Tables of times as loggers write them. The header is read, not skipped: it names the columns, in any order, and their
-units (``delay_ms``, ``Delay [s]``, ``latency (us)``). What could be read in two ways is refused."""
+"""Reads tables of times as loggers write them. The header names the columns, in any order, and their units
+(``delay_ms``, ``Delay [s]``, ``latency (us)``). Ambiguous tables are refused."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FLAGS = {"0": False, "false": False, "no": False, "": False, "1": True, "true":
 
 
 class TableError(ValueError):
-    """A table that cannot be read, or in more than one way; the message is one line for people."""
+    """A table that is unreadable or ambiguous; the message is one line for people."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +43,8 @@ class Table:
     rows: tuple[tuple[int, tuple[str, ...]], ...]
 
     def column(self, *names: str) -> Column | None:
-        """The column of times called one of ``names``, the first that is there. Raises TableError without a unit, or
-        if there are two."""
+        """The column of times with the first of ``names`` that the table has. Raises TableError if it has no unit, or
+        if two columns have that name."""
         for name in names:
             found = [(k, unit) for k, (title, unit) in enumerate(map(_title, self.titles)) if title == name]
             if not found:
@@ -62,11 +62,11 @@ class Table:
         return None
 
     def text(self, *names: str) -> int | None:
-        """Index of the column of text called one of ``names``."""
+        """Index of the text column with one of ``names``."""
         return next((k for k, title in enumerate(self.titles) if _title(title)[0] in names), None)
 
     def lost(self) -> Iterator[bool]:
-        """Whether each row says that it was lost."""
+        """For each row, whether it is marked as lost."""
         index = self.text("lost", "loss", "dropped", "is_lost")
         for line, row in self.rows:
             word = "" if index is None else row[index].lower()
@@ -75,7 +75,7 @@ class Table:
             yield _FLAGS[word]
 
     def times_ms(self, column: Column) -> Iterator[float]:
-        """The column's values in ms; NaN for blank and for words of nothing, if there is a header."""
+        """The column's values in ms; NaN for blanks and, if there is a header, for words that mean a missing value."""
         for line, row in self.rows:
             word = row[column.index]
             if self.titles and word.lower() in _NOTHING:
@@ -87,8 +87,8 @@ class Table:
 
 
 def read_table(text: str) -> Table:
-    """The table in ``text``: separated by tabs, semicolons, commas or blanks. Lines that begin with # are comments; the
-    last one before the numbers may be the header. Decimal commas are understood where commas separate nothing.
+    """The table in ``text``, separated by tabs, semicolons, commas or blanks. Lines that begin with # are comments; the
+    last one before the numbers may be the header. Decimal commas are accepted if commas are not separators.
 
     Raises TableError.
     """

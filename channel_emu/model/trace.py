@@ -82,11 +82,11 @@ class TraceWriter:
 
     def __init__(self, path: Path, config: ChannelConfig, seed: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._lock = path.open("ab")  # changes nothing of a file that is another's
+        self._lock = path.open("ab")  # does not modify a file that another emulator writes
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            # Devices such as /dev/null are for all, and some file systems have no locks.
+            # Devices such as /dev/null may be shared, and some file systems have no locks.
             if isinstance(error, BlockingIOError) and path.is_file():
                 self._lock.close()
                 raise TraceError(f"{path}: another emulator writes its trace there: name another file") from None

@@ -229,7 +229,7 @@ def test_depth_that_cannot_be_sent_costs_only_the_depth(caplog, wrong, message):
         assert shot.encoded_depth is None and camera.depth_failed == tick + 1
         assert tick or shot.payload == whole.payload
     (record,) = caplog.records
-    assert record.getMessage().startswith("cam01: a frame without its depth: ") and message in record.getMessage()
+    assert record.getMessage().startswith("cam01: frame sent without depth: ") and message in record.getMessage()
     unasked = depth_camera(0, **wrong)
     assert unasked.capture(0).encoded_depth is None and not unasked.depth_failed
 

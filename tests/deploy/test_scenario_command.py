@@ -79,7 +79,7 @@ def test_a_file_of_ones_own_starts_as_a_shipped_one_and_is_valid(name, tmp_path,
 
 def test_check_reads_every_section(tmp_path, capsys):
     for section, wrong in (
-        ("source: {kind: mcap, file: a.mcap}", "cameras.phase: spread is for source.kind world alone"),
+        ("source: {kind: mcap, file: a.mcap}", "cameras.phase: spread applies to source.kind world only"),
         ("source: {kind: world, scene: castle}", "source: .*castle"),
         ("source: {kind: world, effects: {OWN:Darker: {counts: 256}}}", "Darker.counts: expected .*0 to 255, got 256"),
         ("source: {kind: OWN:Turning, level: 256}", "source.level: expected .*0 to 255, got 256"),
@@ -89,7 +89,7 @@ def test_check_reads_every_section(tmp_path, capsys):
         ("edge: {policy: {name: freshest-k, value: 0.5}}", "edge.policy: k: expected a whole number"),
         ("edge: {field: OWN:Flat, field_options: {level: 2}}", "edge.field: flat.level: expected .*0 to 1, got 2"),
         ("channel: {faults: {rain: 1}}", "channel.faults.rain"),
-        ("channel: {faults: {blackout: {windows_ms: [[0, 1]], cameras: [me]}}}", "'me' is none of the scenario's: "),
+        ("channel: {faults: {blackout: {windows_ms: [[0, 1]], cameras: [me]}}}", "'me' is not one of the scenario's: "),
     ):
         file = tmp_path / "mine.yaml"
         source = "" if section.startswith("source") else "source: {kind: world, scene: room}\n"

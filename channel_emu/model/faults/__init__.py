@@ -16,12 +16,12 @@ from freshfield.settings import Settings
 NAMES = ("loss", "duplication", "corruption", "blackout", "reset", "bandwidth")
 
 
-# Where not a module of the fault's own name.
+# Modules of faults whose module does not have the fault's name.
 _MODULES = {"loss": "chance", "duplication": "chance"}
 
 
 def params_class(name: str) -> type[Any]:
-    """The parameters of the fault ``name``, one of NAMES or from outside (``freshfield.plugins``). Imports the fault's
+    """The parameters of the fault ``name``, one of NAMES or a plug-in (``freshfield.plugins``). Imports the fault's
     module. Raises PluginError for an unknown name."""
     if name in NAMES:
         return _module(name).Params  # type: ignore[no-any-return]
@@ -34,7 +34,7 @@ def params_class(name: str) -> type[Any]:
 
 
 def make(params: dict[str, Any], seed: int, camera: str) -> tuple[Fault, ...]:
-    """The faults of one camera, in the order of NAMES, then those from outside. params: ``Params`` by fault name."""
+    """The faults of one camera, in the order of NAMES, then plug-ins. params: ``Params`` by fault name."""
     listed = [name for name in NAMES if name in params]
     built_in = [getattr(_module(name), name.capitalize())(params[name], seed, camera) for name in listed]
     others = [_outside(name)(params[name], seed, camera) for name in params if name not in NAMES]
@@ -53,5 +53,5 @@ def _module(name: str) -> Any:
 
 
 def per_state(value: float | list[float]) -> list[float]:
-    """A value as a list: one entry a state, or one for all."""
+    """A value as a list: one entry per chain state, or one for all."""
     return list(value) if isinstance(value, list) else [value]
