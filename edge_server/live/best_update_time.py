@@ -1,5 +1,5 @@
-"""What accuracy costs in time, as ``edge-server frontier`` measured it: for the page, the report, and the
-update time that it recommends."""
+"""The trade-off of accuracy against time, as ``edge-server frontier`` measured it: for the page, the report and the
+recommended update time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_frontier(path: Path | None, representation: str, layers: bool = False) 
 
     path: a frontier.json of ``edge-server frontier``; None: the shipped one.
     layers: whether to read the points of that representation in layers, or those without layers.
-    Where an earlier version did not measure what was shown, a point has the PSNR of what was published.
+    If an earlier version did not measure fidelity as shown, a point has the PSNR as published.
     Raises ValueError for another kind of file, or one without such points.
     """
     source = path if path is not None else resources.files("edge_server").joinpath("frontier.json")
@@ -45,8 +45,8 @@ def read_frontier(path: Path | None, representation: str, layers: bool = False) 
 
 
 def points_of(rows: Sequence[Mapping[str, Any]]) -> list[FrontierPoint]:
-    """The points of a frontier.json's ``updates``, without those where nothing that moves was scored.
-    KeyError, TypeError or ValueError where a row is none of these."""
+    """The points of a frontier.json's ``updates``, without those that have no score of moving pixels.
+    Raises KeyError, TypeError or ValueError for an invalid row."""
     return [
         FrontierPoint(
             speed_m_per_s=float(row["speed_m_per_s"]),
@@ -65,7 +65,7 @@ def points_of(rows: Sequence[Mapping[str, Any]]) -> list[FrontierPoint]:
 def best_point(points: Sequence[FrontierPoint], speed_m_per_s: float = tuned.USUAL_SPEED_M_PER_S) -> FrontierPoint:
     """The best of the points measured at the speed nearest to ``speed_m_per_s``.
 
-    More time is not always better: what moves ages meanwhile. Of the points that are within the standard
+    More time is not always better, because moving objects age meanwhile. Of the points within the standard
     error of the best, the fastest is taken.
     """
     candidates = _at_nearest_speed(points, speed_m_per_s)

@@ -20,9 +20,9 @@ from freshfield.limits import MAX_CAPTURE_AHEAD_NS
 class FrameBuffer:
     """The newest frame of each training camera. Thread-safe.
 
-    Memory is one encoded frame a camera, whatever arrives; ``MOST_UNSELECTED`` more with ``keep_every_frame``.
+    Memory is one encoded frame per camera, whatever arrives; ``MOST_UNSELECTED`` more with ``keep_every_frame``.
     arrivals: frames put in so far. stale_on_arrival: those that arrived after a newer one of their camera.
-    held_back: frames that the last ``take`` had no room for, and that wait on.
+    held_back: frames beyond the limit of the last ``take``, which keep waiting.
     shed: frames left out for lack of time since the first ``take``, with ``keep_every_frame``.
     """
 
@@ -40,10 +40,10 @@ class FrameBuffer:
         self._last_take = dict.fromkeys(self.cameras, 0.0)  # the last one that took a frame of each camera
 
     def put(self, frame: Frame, received_ns: int) -> None:
-        """Keep ``frame`` unless a newer one of its camera is here.
+        """Keep ``frame`` unless a newer one of its camera is in the buffer.
 
         A newer one dated after ``received_ns`` comes from a clock that has been corrected since, and is
-        replaced: otherwise its camera would stand still until that time.
+        replaced: otherwise its camera would appear frozen until that time.
         """
         item = replace(frame, received_ns=received_ns)
         with self._arrived:
@@ -78,17 +78,17 @@ class FrameBuffer:
 
         selected: newest frames that the policy selected.
         most: largest number of frames to take that were not taken before; None: all.
-        moving: by camera, the share of its image that moves; 1 where nothing is known.
+        moving: by camera, the share of its image that moves; 1 if unknown.
         Returns the frames of ``selected`` to use, and the other frames of their cameras that had arrived by
         then, in the order of their arrival. Without ``keep_every_frame`` these are ``selected`` and none.
 
         ``most`` admits the newest frame of each camera first, then the second newest of each, and so on.
         Frames of equal rank go in this order: cameras without a frame in the last ``LONGEST_WAIT`` takes, the
-        longest wait first; then those of cameras before which most moves, each counting less with its age
-        (``FADES_MS``); among equals, the camera that has waited longest. What exceeds ``most`` waits on, after
-        the next ``take``'s newer frames: a burst is worked off later. The oldest of more than
-        ``MOST_UNSELECTED`` of a camera are dropped and counted in ``shed``. Frames of cameras that were not
-        selected are dropped; those of them that had waited for lack of time are counted, too.
+        longest wait first; then by the share of the image that moves, discounted by the frame's age
+        (``FADES_MS``); among equals, the camera that has waited longest. Frames beyond ``most`` stay queued behind
+        the next ``take``'s newer frames, so a burst is worked off later. Beyond ``MOST_UNSELECTED`` of a camera, the
+        oldest are dropped and counted in ``shed``. Frames of cameras that were not selected are dropped; those that
+        had waited for lack of time are counted, too.
         """
         until_ns = max((item.received_ns for item in selected), default=0)
         own = {item.camera: item for item in selected}

@@ -1,8 +1,8 @@
-"""Notices that a camera moves, from the poses that its frames report.
+"""Detects camera motion from the poses that frames report.
 
-Noise of poses is no motion, nor is a single wrong pose, nor that a camera is knocked or calibrated anew: then
-it stands still somewhere else. So a camera moves if it has left the place where it stood twice, each time by
-more than ``APART_M`` or ``APART_DEG``, in two frames in a row.
+Pose noise, a single wrong pose, and a camera that is knocked or recalibrated (and then stands still elsewhere) do not
+count as motion. So a camera moves if it has left its place twice, each time by more than ``APART_M`` or
+``APART_DEG``, in two consecutive frames.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ class _Place:
 
 
 class CameraMotion:
-    """Follows the poses of all cameras; memory is one pose a camera."""
+    """Tracks the poses of all cameras; memory is one pose per camera."""
 
     def __init__(self) -> None:
         self._places: dict[str, _Place] = {}
 
     def moving(self, views: Iterable[View]) -> str | None:
-        """Take in the poses of views, each camera's in the order of capture (older ones are ignored). Returns
-        a camera that moves; None as long as none is known to."""
+        """Process the poses of views, each camera's in the order of capture (older ones are ignored). Returns
+        a camera that moves; None while none is known to."""
         for view in views:
             place = self._places.get(view.camera)
             if place is None:

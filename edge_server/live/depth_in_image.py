@@ -1,4 +1,4 @@
-"""Measured depth at the pixels of its image. Imported with the first frame that brings depth."""
+"""Registers measured depth to the pixels of its image. Imported with the first frame that has depth."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from freshfield.depth import DepthImage
 from freshfield.geometry import Pinhole, Pose
 
 _Lens = tuple[Pinhole, Pose | None, int]
-_kept: dict[_Lens, NDArray[np.float32]] = {}  # rays of lenses, the one that was used longest ago first
+_kept: dict[_Lens, NDArray[np.float32]] = {}  # rays of lenses, least recently used first
 _keeping = Lock()
 
 
@@ -24,10 +24,9 @@ def depth_in_image(depth: DepthImage, lens: Pinhole, halvings: int) -> NDArray[n
     lens: of the image before it was halved, ``halvings`` times, to H x W.
 
     Each pixel takes the measurement nearest to its center: a mean over pixels would lie between two surfaces. Depth
-    of a lens of its own is first moved into the image, at the coarser of both resolutions, so that no gaps open
-    between its pixels; of what lands on one pixel the nearest surface counts. Of depth with more than
-    ``MAX_DEPTH_POINTS`` pixels for each of the image's, or ``MOST_DEPTH_MOVED`` in all, only each n-th row and column
-    is moved.
+    with its own lens is first reprojected into the image, at the coarser of both resolutions, so that no gaps open
+    between its pixels; the nearest surface wins. Of depth with more than ``MAX_DEPTH_POINTS`` pixels per image pixel,
+    or ``MOST_DEPTH_MOVED`` in all, only every n-th row and column is reprojected.
     """
     image = lens.halved(halvings)
     if depth.intrinsics is None:
@@ -41,7 +40,7 @@ def depth_in_image(depth: DepthImage, lens: Pinhole, halvings: int) -> NDArray[n
 
 
 def _sampled(depth: NDArray[np.float32], image: Pinhole, per_column: float, per_row: float) -> NDArray[np.float32]:
-    """Depth at the centers of the image's pixels. per_column, per_row: depth pixels for each of the image's."""
+    """Depth at the centers of the image's pixels. per_column, per_row: depth pixels per image pixel."""
     if per_column == per_row == 1.0:
         return depth
     rows = np.minimum((np.arange(image.height) + 0.5) * per_row, depth.shape[0] - 1).astype(np.intp)
@@ -50,20 +49,20 @@ def _sampled(depth: NDArray[np.float32], image: Pinhole, per_column: float, per_
 
 
 def _step(sensor: Pinhole, image: Pinhole) -> int:
-    """Every so many-th row and column of the sensor is moved. A wide sensor's resolution alone would not bound them."""
+    """Stride of the sensor's rows and columns to reproject. A wide sensor's resolution alone would not bound them."""
     most = min(MAX_DEPTH_POINTS * image.width * image.height, MOST_DEPTH_MOVED)
     least = math.ceil(math.sqrt(sensor.width * sensor.height / most))
     return max(least, int(min(sensor.fx / image.fx, sensor.fy / image.fy)))
 
 
 def _moved(depth: DepthImage, sensor: Pinhole, grid: Pinhole, step: int) -> NDArray[np.float32]:
-    """Depth in the pixels of ``grid``, the image's lens at some resolution, meters; of each ``step``-th pixel."""
+    """Depth in meters, reprojected into ``grid``, the image's lens at some resolution, from every ``step``-th pixel."""
     z = depth.counts[step // 2 :: step, step // 2 :: step] * np.float32(depth.meters_per_count)
     points = _directions(sensor, depth.to_camera, step) * z[..., None]
     if depth.to_camera is not None:
         points += np.asarray(depth.to_camera.translation_m, np.float32)
     seen = z > 0
-    if grid.distorted:  # far outside its image such a lens may lead back into it
+    if grid.distorted:  # such a lens may map points far outside its image back into it
         seen &= np.hypot(points[..., 0], points[..., 1]) <= points[..., 2] * _reach(grid)
     column, row = np.moveaxis(np.floor(grid.project(points)), -1, 0)
     seen &= (column >= 0) & (column < grid.width) & (row >= 0) & (row < grid.height)
@@ -75,7 +74,7 @@ def _moved(depth: DepthImage, sensor: Pinhole, grid: Pinhole, step: int) -> NDAr
 
 
 def _directions(sensor: Pinhole, to_camera: Pose | None, step: int) -> NDArray[np.float32]:
-    """Each ``step``-th pixel's point at depth 1, turned into the camera's axes, float32 (H, W, 3).
+    """Every ``step``-th pixel's point at depth 1, rotated into the camera's axes, float32 (H, W, 3).
 
     Those of the lenses used last are kept, up to ``MAX_DEPTH_RAYS_BYTES`` in all.
     """

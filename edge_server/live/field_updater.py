@@ -42,11 +42,11 @@ class Selection:
     """A finished decision.
 
     now_ns: instant of the selection.
-    items: selected frames, without the new ones that the field has no time for.
-    others: other frames that these cameras delivered since the last selection, where the field wants every
-    frame and has time for them.
-    arrivals: number of frames since the last selection, of all cameras; where the field wants every frame, of
-    those that the update uses.
+    items: selected frames, without new ones beyond the update's limit.
+    others: other frames that these cameras delivered since the last selection and that fit the limit, if the field
+    wants every frame.
+    arrivals: number of frames since the last selection, of all cameras; if the field wants every frame, of those
+    that the update uses.
     """
 
     plan: SelectionWindow
@@ -60,14 +60,14 @@ class FieldUpdater:
     """Decides on and carries out the updates of one field from one buffer. Owns no thread, reads no clock.
 
     start_ns: when the run began; ``Publication.t_s`` counts from it.
-    embedder: for policies that look at what the cameras see.
+    embedder: for policies that use image embeddings.
     keyframes: earlier viewpoints of moving cameras.
     foreground: cuts the background out of views.
     on_arrivals: select only after a frame has arrived since the last selection.
     number: number of the next update.
-    forgiving: whether a policy that raises costs a decision only, all views used instead (live). policy_failures: how
-    often that was so with this policy.
-    materialize: gives buffered frames their images and poses where these are made late (virtual time).
+    forgiving: whether all views are used if the policy raises (live). policy_failures: number of times that this
+    policy raised.
+    materialize: gives buffered frames their images and poses if these are made late (virtual time).
     """
 
     def __init__(
@@ -122,13 +122,13 @@ class FieldUpdater:
         self._policy, self.policy_failures = policy, 0
 
     def check(self, policy: Policy) -> None:
-        """ValueError where ``policy`` needs embeddings that are not computed here: there is no embedder, or
+        """Raises ValueError if ``policy`` needs embeddings that are not computed here: there is no embedder, or
         not the one that it was trained with."""
         dim, name = policy.embedding
         if dim == 0:
             return
         if self.embedder is None:
-            raise ValueError(f"{policy.name} decides by what cameras see: it needs an edge.embedding section")
+            raise ValueError(f"{policy.name} decides by image embeddings: it needs an edge.embedding section")
         if dim != self.embedder.dim or (name and name != self.embedder.name):
             raise ValueError(
                 f"{policy.name} was trained with {name or 'embeddings'} of {dim} numbers, edge.embedding "
@@ -172,7 +172,7 @@ class FieldUpdater:
 
     @property
     def troubles(self) -> tuple[str, ...]:
-        """What goes wrong, for people: the field's, and the policy's."""
+        """Problems of the field and of the policy, in words."""
         found = tuple(getattr(self.field, "troubles", ()))
         if self.policy_failures:
             found += (
@@ -183,12 +183,12 @@ class FieldUpdater:
     def select(
         self, plan: SelectionWindow, now_ns: int, budget: Budget | None = None, most_new: int | None = None
     ) -> Selection | None:
-        """The second half of a decision: the frames in the buffer at ``now_ns`` that the policy uses; None:
-        wait on.
+        """The second half of a decision: the frames in the buffer at ``now_ns`` that the policy uses; None: keep
+        waiting.
 
         For a field that wants every frame, the number of new frames is limited:
         budget: what the fit that follows may spend; one in seconds sets the limit.
-        most_new: the limit otherwise (virtual time, where no clock tells what the field has time for).
+        most_new: the limit otherwise (virtual time, where no clock determines it).
         """
         total, newest = self.buffer.observe()
         arrivals = total - self._selected_of
@@ -215,18 +215,18 @@ class FieldUpdater:
         return Selection(plan, now_ns, items, others, arrivals)
 
     def _most_new(self, budget: Budget | None, most_new: int | None) -> int | None:
-        """Number of new frames that a field that wants every frame has time for; None: all."""
+        """Number of new frames for which a field that wants every frame has time; None: all."""
         frame_s = self.field.frame_s
         if not frame_s or budget is None or budget.seconds is None:
             return None if frame_s is None else most_new
-        # Of an update that takes longer than its budget, on a slow machine, frames take their share as well.
+        # On a slow machine an update may exceed its budget; frames then get their share of its real duration.
         seconds = max(budget.seconds, self._update_s)
         return max(int(tuned.INTAKE_SHARE * seconds / frame_s), tuned.LEAST_TAKEN)
 
     def fit(self, selection: Selection, budget: Budget) -> tuple[list[View], FitReport] | None:
         """Decode the selected views and train on them.
 
-        Returns the views as they were delivered, and the field's report; None where no view can be decoded.
+        Returns the views as delivered, and the field's report; None if no view can be decoded.
         """
         views = self.decoder.views(selection.items)
         if not views:
@@ -249,13 +249,13 @@ class FieldUpdater:
     def watch_cameras(
         self, config: EdgeConfig, make: Callable[[EdgeConfig], Field], changed: Callable[[EdgeConfig, str], None]
     ) -> None:
-        """Once a camera is seen to move, begin anew with field, keyframes and updates of ``config``.
+        """Restart with field, keyframes and updates of ``config`` once a camera is found to move.
 
         make: makes the field. changed(config, camera): called then, on the thread of ``fit``.
         """
 
         def if_moving(camera: str) -> None:
-            self.field.reset()  # gives back what the next one shares with it
+            self.field.reset()  # releases what it shares with the next one
             self.field = make(config)
             self.field.warm_up()
             self.keyframes = _keyframes(config)
@@ -306,7 +306,7 @@ def open_updater(
     resumed: bool = False,
     embedder: Embedder | None = None,
 ) -> FieldUpdater:
-    """The updater of a scenario's training cameras, with what its edge section asks for.
+    """The updater of a scenario's training cameras, configured by its edge section.
 
     resumed: the field has been trained before (see ``Keyframes``).
     embedder: one that several runs share; None opens the scenario's.
@@ -337,12 +337,12 @@ def open_updater(
 
 
 def _use_depth_network(field: Field, file: Path) -> None:
-    """Open it, where the field can use one: ``splat`` in layers. ValueError: the file holds none."""
+    """Open the network if the field can use one: ``splat`` in layers. Raises ValueError if the file holds none."""
     from edge_server.embed import open_depth_network
 
     use = getattr(field, "use_depth_network", None)
-    if use is None:  # of a run that is resumed cameras may have begun to move
-        log.warning("edge.depth_network is left unused: only splat in layers, of cameras that stand still, can use one")
+    if use is None:  # in a resumed run, cameras may have begun to move
+        log.warning("edge.depth_network is ignored: only splat in layers, with fixed cameras, can use one")
         return
     try:
         use(open_depth_network(file))

@@ -95,7 +95,7 @@ class EdgeService(edge_pb2_grpc.EdgeServiceServicer):
             try:
                 self._state.set_policy(request.name or controls.policy, value)
             except ValueError as error:
-                # ``abort`` raises an error that a reference cycle keeps, and with it 8 MB of request.
+                # ``abort`` raises an error that a reference cycle keeps alive, and with it 8 MB of request.
                 context.set_code(grpc.StatusCode.INVALID_ARGUMENT)
                 context.set_details(str(error))
                 return edge_pb2.SetPolicyResponse()
@@ -146,7 +146,7 @@ class GrpcThread:
         self._thread = threading.Thread(target=self._main, name="grpc", daemon=True)
 
     def start(self) -> None:
-        """Start, and return once the server listens. Raises the error that kept it from listening."""
+        """Start, and return once the server listens. Raises the error that prevented it from listening."""
         self._thread.start()
         self._ready.wait()
         if self._failure is not None:

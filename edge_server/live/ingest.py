@@ -1,4 +1,4 @@
-"""Frames arrive: the checks against earlier frames, the buffer, the ledger, the response.
+"""Ingest of frames: checks against earlier frames, the buffer, the ledger, the response.
 
 Ingest never waits for the field and never decodes: it answers as soon as checksum, headers and limits are
 checked and the frame is buffered.
@@ -47,7 +47,7 @@ class _Session:
 
 @dataclass
 class DepthArrivals:
-    """Depth that came with one camera's frames. bytes: encoded. newest_ns: when the newest was measured, edge clock."""
+    """Depth received with one camera's frames. bytes: encoded. newest_ns: when the newest was measured, edge clock."""
 
     frames: int = 0
     bytes: int = 0
@@ -67,7 +67,7 @@ class FrameAdmission:
 
     training, held_out: ids of the cameras in each role.
     max_side_px: longest side of an image, pixels; see ``Scenario.max_side_px``.
-    known: what ``last_frames`` told in an earlier process, so that no frame is taken again after a restart.
+    known: ``last_frames`` of an earlier process, so that no frame is taken again after a restart.
     codec: of the images, as the scenario says; None: any.
     """
 
@@ -102,7 +102,7 @@ class FrameAdmission:
         if frame.camera not in self._roles:
             raise FrameRejected("unknown_camera", f"camera {frame.camera!r} is not part of this scenario")
         if frame.held_out != self._roles[frame.camera]:
-            raise FrameRejected("wrong_role", f"{frame.camera} is held out on one side and not on the other")
+            raise FrameRejected("wrong_role", f"{frame.camera} is held out at only one of node and edge")
         if self._codec is not None and frame.codec != self._codec:
             raise FrameRejected(
                 "unknown_codec", f"a {frame.codec}, where the scenario (source.codec) has {self._codec}: the same file?"
@@ -208,9 +208,9 @@ class Ingest:
                 await stream.write(self.take(message, stream))
 
     def take(self, message: bytes | pb.PushRequest, stream: ServedCall | None = None) -> pb.PushResponse:
-        """Check one frame, buffer it and enter it in the ledger; the response says what became of it.
+        """Check one frame, buffer it and enter it in the ledger; the response gives the outcome.
 
-        stream: the call that it came on, which claims the frame's session; None: nothing claims it.
+        stream: the call that carried it, which claims the frame's session; None: nothing claims it.
         """
         start_s = time.perf_counter()
         now_ns = self._clock.now_ns()
@@ -248,6 +248,6 @@ class Ingest:
 
 
 def percentile(values: deque[float], percent: float) -> float | None:
-    """The value that ``percent`` of ``values`` do not exceed; None without values. Another thread may add some."""
+    """The value that ``percent`` of ``values`` do not exceed; None if empty. Another thread may add values."""
     known = values.copy()
     return float(np.percentile(known, percent, method="inverted_cdf")) if known else None

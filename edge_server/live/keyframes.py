@@ -1,17 +1,15 @@
-"""Keyframes: earlier viewpoints of moving cameras go on supervising. One camera on an arm is many cameras in
-time.
+"""Keyframes: earlier viewpoints of moving cameras, which continue to supervise the field.
 
-The buffer holds the newest frame of a camera and nothing else. That suffices for a camera that stands still;
-with one that moves, the field would forget, update by update, what it no longer looks at. So each used view
-becomes a keyframe if it lies apart from all earlier ones of its camera; otherwise it replaces the image of
-the nearest one. Distances are measured from where a keyframe was first taken, never from the image that
-replaced it: a slow camera would otherwise push one keyframe along for ever. Keyframes go to the field as
-views of cameras of their own, named ``hand#3``: no camera of a scenario may have such a name. Their ages are
-real: a scene that changes asks for few keyframes, or for a field that trusts old views less (``age_tau_ms``).
+The buffer holds only the newest frame of a camera. That suffices for a fixed camera; with a moving one, the field
+would gradually forget what the camera no longer sees. So each used view becomes a keyframe if it is far enough from
+all earlier ones of its camera; otherwise it replaces the image of the nearest one. Distances are measured from where
+a keyframe was first taken, never from the image that replaced it: a slow camera would otherwise drag one keyframe
+along for ever. The field sees keyframes as views of separate cameras, named ``hand#3``: no camera of a scenario may
+have such a name. Their ages are real: a changing scene needs few keyframes, or a field that trusts old views less
+(``age_tau_ms``).
 
-A field trained on one or two viewpoints fits only those, and later viewpoints do not undo that (measured: 3
-dB in the cell). So the field restarts each time the number of viewpoints has doubled, up to
-``RESTARTS_BELOW``.
+A field trained on one or two viewpoints overfits to them, and later viewpoints do not undo that (measured: 3 dB in
+the cell). So the field restarts each time the number of viewpoints has doubled, up to ``RESTARTS_BELOW``.
 """
 
 from __future__ import annotations
@@ -29,8 +27,8 @@ from edge_server.settings import KeyframesConfig
 
 @dataclasses.dataclass
 class _Keyframe:
-    """anchor: the view that first lay here, which defines the place. view: its image now. apart: distance
-    between the two, 1 where ``view`` would become another keyframe."""
+    """anchor: the view that created the keyframe and defines its place. view: its current image. apart: distance
+    between the two; at 1, ``view`` would become another keyframe."""
 
     anchor: View
     view: View
@@ -58,7 +56,7 @@ class Keyframes:
 
     def should_restart(self, count: int) -> bool:
         """Whether the field should restart with an update of ``count`` views. True counts as a restart."""
-        if self._started_with == 0:  # the very first: the field is new
+        if self._started_with == 0:  # first update: the field is new
             self._started_with = min(count, tuned.RESTARTS_BELOW)
             return False
         if self._started_with >= tuned.RESTARTS_BELOW or count < 2 * self._started_with:
@@ -77,7 +75,7 @@ class Keyframes:
         return [*views, *earlier]
 
     def clear(self) -> None:
-        """Forget all: the scene is another one."""
+        """Forget all keyframes: the scene is a new one."""
         self._cameras.clear()
         self._started_with = 0
 
@@ -96,14 +94,14 @@ class Keyframes:
                 number = min(frames, key=lambda each: frames[each].view.generated_ns)
             frames[number] = _Keyframe(view, self._named(view, number))
         elif frames[number].view.generated_ns != view.generated_ns and (
-            # A slow camera on its way out would otherwise leave every keyframe with an image from its edge.
+            # Otherwise a slow camera that leaves would give every keyframe an image from its boundary.
             camera.current != number or apart <= max(tuned.NEAR_KEYFRAME, frames[number].apart)
         ):
             frames[number].view, frames[number].apart = self._named(view, number), apart
         camera.current = number
 
     def _apart(self, a: View, b: View) -> float:
-        """Distance of two views, 1 where they become two keyframes; infinite with different lenses."""
+        """Distance of two views; at 1 they become separate keyframes; infinite with different lenses."""
         if a.intrinsics != b.intrinsics:
             return np.inf
         apart_m, apart_deg = pose_distance(a.camera_to_world, b.camera_to_world)

@@ -25,11 +25,11 @@ class UpdateLoop:
 
     grace_ms: how long the first update waits for cameras that have not reported.
     on_published(publication, renderer, views): called after each update, on the loop's thread.
-    on_status(line): says what the loop is doing.
+    on_status(line): reports what the loop is doing.
     on_checkpoint(path): writes the field, between two updates.
-    on_event(what): says that an operator's change took effect.
-    controls: what operators change; it takes effect with the next decision.
-    update_ms: fitting time of an update, however long the rest of it takes.
+    on_event(what): reports that an operator's change took effect.
+    controls: operators' changes, which take effect with the next decision.
+    update_ms: fitting time of an update, whatever the rest of it takes.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class UpdateLoop:
             self.failure = error
 
     def _await_cameras(self) -> None:
-        """Give every camera a chance to report, so that the first fit does not see half of them."""
+        """Give every camera a chance to report, so that the first fit does not miss half of them."""
         arrivals, first_ns = 0, None
         wanted = len(self._updater.buffer.cameras)
         while not self._stop.is_set():
@@ -120,7 +120,7 @@ class UpdateLoop:
             self._paused = self._controls.paused
             self._on_event(f"an operator {'paused updates' if self._paused else 'resumed'}")
         if self._paused:
-            self._updater.buffer.keep_every_frame(False)  # what comes meanwhile is not left out for lack of time
+            self._updater.buffer.keep_every_frame(False)  # frames that arrive meanwhile do not count as shed
             self._on_status("paused")
             self._stop.wait(tuned.LONGEST_SLEEP_S)
             return
@@ -153,14 +153,14 @@ class UpdateLoop:
         self._write_checkpoints()
 
     def _warn_of_haste(self, report: FitReport) -> None:
-        """Log now and then what share of the updates made no step, and of the frames was left out, for lack of time."""
+        """Log occasionally how many updates made no step, and how many frames were left out, for lack of time."""
         self.without_step += report.short
         self._too_short.append(report.short)
         buffer, now_s = self._updater.buffer, self._clock.now_ns() / 1e9
         if sum(self._too_short) >= tuned.TOO_SHORT and now_s - self._warned_short_s >= tuned.WARN_EVERY_S:
             self._warned_short_s = now_s
             log.warning(
-                "%d of %d updates made no step: their time went into taking in new pictures. Send smaller ones "
+                "%d of %d updates made no step: taking in new images used up their time. Send smaller ones "
                 "(source.scale, or width and height), or give updates more time (edge.update_ms)",
                 sum(self._too_short),
                 len(self._too_short),
@@ -171,7 +171,7 @@ class UpdateLoop:
         self._warned_of = (buffer.shed, buffer.arrivals, now_s)
         if buffer.shed > shed:
             log.warning(
-                "%d of %d frames were left out, mostly the oldest: the field has no time for them. Fewer or smaller "
+                "%d of %d frames were left out, mostly the oldest, for lack of time. Fewer or smaller "
                 "ones (source.fps; source.scale, or width and height) or longer updates (edge.update_ms) help",
                 buffer.shed - shed,
                 buffer.arrivals - arrived,

@@ -69,7 +69,7 @@ class ServerOptions:
     out: folder of the run's files.
     transport: security of connections.
     page_host: address on which page and metrics listen.
-    open_page: starts the live page of a state; None: no page. open_foxglove: the same of the server for Foxglove.
+    open_page: starts the live page of a state; None: no page. open_foxglove: likewise the server for Foxglove.
     metrics_port: port of Prometheus metrics; None: no metrics.
     lpips_folder: folder with LPIPS weights; None: that of $FRESHFIELD_LPIPS, if any.
     resume: checkpoint to start from. checkpoint_s: period of writing one, seconds; None: only at the end.
@@ -109,7 +109,7 @@ class EdgeServer:
         state, about = None, dict[str, Any]()
         if options.resume is not None:
             state, about = checkpoint.load(options.resume, most_bytes=stored_bytes(options.resume))
-        # What moves, in words: nothing yet, or what the earlier run knew.
+        # The camera that moves: none yet, or the one that the earlier run found.
         self._moving = str(about.get("moving") or ("a camera" if cameras_move(scenario) else ""))
         config_if_moving = msgspec.structs.replace(read_config(scenario, moving=True), policy=config.policy)
         self.config, first = (config_if_moving if about.get("moving") else config), config
@@ -150,10 +150,10 @@ class EdgeServer:
             log.info("recording to %s", self.recorder.file)
         self.ledger = Ledger(options.out, "edge", "edge", self.start_ns)  # once nothing above can fail any more
         earlier = _earlier(options.out / "edge.json")
-        counted = earlier.updates or UpdateCounts()  # the run's, as its ledgers, which go on
+        counted = earlier.updates or UpdateCounts()  # continued over the whole run, like its ledgers
         self._earlier_undecodable, self._earlier_shed = counted.undecodable or 0, counted.shed or 0
         self._counts.refused = dict(counted.refused)
-        # Where the field begins anew, or from a checkpoint that a kill has outlived, so do numbers and counts.
+        # If the field restarts, or resumes from a checkpoint older than a kill, so do numbers and counts.
         short = max(0, int(about.get("without_step", 0)))
         self._earlier_updates = max(0, counted.count - self.updater.number)
         self._earlier_short = max(0, (counted.without_step or 0) - short)
@@ -207,14 +207,14 @@ class EdgeServer:
     # --- running ----------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Serve until stopped, then write everything down. Raises what ended the update loop, if it
-        failed; TransportError if a port would be open to others."""
+        """Serve until stopped, then write everything to disk. Raises the update loop's error, if it failed;
+        TransportError if a port would be open to others."""
         grpc = GrpcThread(
             self.options.transport, self.options.listen, self.ingest, self.clock, self.state, self._stopping
         )
         try:
             self.state.warnings = self._warnings()
-            self.scoring.load()  # before frames come: they would wait for it
+            self.scoring.load()  # before frames arrive: they would wait for it
             grpc.start()
         except BaseException:
             self._leave_no_trace()
@@ -241,7 +241,7 @@ class EdgeServer:
         finally:
             self._stopping.set()
             self.loop.stop()
-            self._write_field()  # first: who asked for the end does not wait for ever
+            self._write_field()  # first: whoever stopped the server does not wait for ever
             self.scoring.stop(tuned.LAST_SCORES_S)
             grpc.join(tuned.GRPC_END_S)
             self._write_final() if served else self._leave_no_trace()
@@ -275,7 +275,7 @@ class EdgeServer:
                 self.journal.write_status()
             ticks += 1
             every_s = self.options.checkpoint_s
-            # None waits behind another: cameras may come after hours, and as many would be written one after the other.
+            # At most one is pending: if cameras come only after hours, those due until then would be written in a row.
             due = every_s is not None and now_ns - saved_ns > every_s * 1e9
             if due and (saving is None or saving.done()):
                 saved_ns = now_ns
@@ -332,13 +332,13 @@ class EdgeServer:
         return make_field(config.field, {"nice": tuned.FIELD_NICE, **config.field_options}, seed=self.scenario.seed)
 
     def _camera_moves(self, config: EdgeConfig, camera: str) -> None:
-        """Follow the updater, which has begun anew because ``camera`` moves."""
+        """Follow the updater, which has restarted because ``camera`` moves."""
         self.config, self._moving = config, camera
         self.loop.update_ms = config.update_ms
         self.state.chosen = described(self.scenario, config, camera)
         log.info("%s", self.state.chosen)
-        self.state.note(f"the field began anew: {camera} moves")
-        with contextlib.suppress(ValueError):  # the file that a scenario names may know the first choice only
+        self.state.note(f"the field was restarted: {camera} moves")
+        with contextlib.suppress(ValueError):  # a scenario's frontier may cover the first choice only
             self.frontier = self.state.frontier = open_frontier(self.scenario, config)
             write_json(self.options.out / "frontier.json", msgspec.to_builtins(self.frontier))
 
@@ -454,16 +454,16 @@ class EdgeServer:
         except OSError as error:
             log.error("not everything was written at the end: %s", error)
         finally:
-            # Whatever failed, the ledger is complete and the status is the last one.
+            # Whatever failed, the ledger is complete and the last status is written.
             try:
                 self._close_records()
             finally:
                 self.journal.close()
 
     def _leave_no_trace(self) -> None:
-        """Close the files of a start that served nothing: edge.json and frontier.json, and with them the report, stay
-        those of an earlier run. A ledger without a frame goes; one with frames that came before the page's port was
-        refused, say, is called so that it counts as no start of the run."""
+        """Close the files of a start that failed: edge.json and frontier.json, and with them the report, stay those of
+        an earlier run. A ledger without frames is deleted; one with frames (say, received before the page's port was
+        refused) is renamed so that it does not count as a start of the run."""
         try:
             self._close_records()
             path = self.ledger.path

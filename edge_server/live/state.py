@@ -1,7 +1,7 @@
-"""The shared state of a running edge server: what people see of it and what they may change.
+"""The shared state of a running edge server: what people can see and change.
 
-The loop and ingest write it; page, metrics and status service read it. Readers never wait for the field:
-whatever they get is immutable, or was copied under a short lock.
+The loop and ingest write it; page, metrics and status service read it. Readers never wait for the field: all they get
+is immutable, or was copied under a short lock.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from freshfield.frame import Frame
 class Publication:
     """One update of the field: a line of series.jsonl and of the report's fidelity series.
 
-    number: counts updates from 0; a resumed run goes on counting.
+    number: counts updates from 0; a resumed run continues to count.
     t_s, published_ns: instant of publication (the present), in seconds since the run began and on the edge's
     clock.
     omega_ms: the policy's omega; None for policies without one.
     selected: cameras whose frames were used. ages_ms: their ages at publication. aaoi_ms: mean of these ages
     (6.35).
     update_ms: time from decision to publication.
-    network_ms: mean time of the selected frames from capture to arrival; what aaoi_ms has beyond update_ms
-    and network_ms is the time that they waited in the buffer.
+    network_ms: mean time of the selected frames from capture to arrival; the rest of aaoi_ms, beyond update_ms
+    and network_ms, is the time that they waited in the buffer.
     steps, loss: of the fit, see ``fields.FitReport``.
-    refused: selected cameras whose view the field left out, because it contradicts all others.
-    psnr_db to truth_gap_ms: None until the held-out truth nearest to the present has arrived, or where there
-    is nothing to score. truth_gap_ms: time from the present to that truth.
+    refused: selected cameras whose view the field left out because it contradicts all others.
+    psnr_db to truth_gap_ms: None until the held-out truth nearest to the present has arrived, or if there is
+    nothing to score. truth_gap_ms: time from the present to that truth.
     scored_on: held-out camera, or SELECTED where nothing is held out (6.21-6.22).
     psnr_refined_db, ssim_refined: see ``fidelity.scorer.Score``.
     """
@@ -90,7 +90,7 @@ class Publication:
 class CameraView:
     """What readers see of a camera: its newest frame (still encoded), its age, its counts.
 
-    measures_depth: whether a frame of it has brought depth.
+    measures_depth: whether any frame of it had depth.
     """
 
     camera: str
@@ -114,8 +114,8 @@ class Comparison:
 
 @dataclass
 class Controls:
-    """What an operator may change during a run; the update loop follows. policy, value: of the policy in force, by
-    name. chosen: the policy to change to; None: none was chosen."""
+    """What an operator may change during a run; the update loop follows. policy, value: name and value of the current
+    policy. chosen: the policy to change to; None: none was chosen."""
 
     policy: str
     value: float | None
@@ -129,14 +129,14 @@ class EdgeState:
     """The state of one run. Methods are thread-safe; the server sets the callbacks once.
 
     start_ns, now_ns: the instant at which the run began, and the present, on the clock of frames.
-    channel: the emulator's status (channel.json) where it runs on the same machine, else None.
-    frontier: what accuracy costs in time, as measured.
+    channel: the emulator's status (channel.json) if it runs on the same machine, else None.
+    frontier: the measured trade-off of accuracy against time.
     chosen: how the edge works and why, in one line (``config.described``).
-    troubles: what the field finds wrong with poses and measured depth, for people.
-    flat_db: PSNR of the mean color of the training images, against what is scored: the held-out views, or where
+    troubles: problems that the field finds in poses and measured depth, in words.
+    flat_db: PSNR of the mean color of the training images against the scored views: the held-out ones, or if
     nothing is held out the views learned from; None: not known.
-    so_far: scores of held-out cameras that move.
-    warnings: what other machines can do here that they should not, in words (--insecure).
+    so_far: scores of moving held-out cameras.
+    warnings: security risks of this run's options (--insecure), in words.
     events: (seconds since the run began, what happened), for the report; ``note`` adds one. Those of an earlier process
         have negative seconds: before it ended.
     status_line: what the loop is doing, in one line for people, e.g. waiting for a first frame.
@@ -184,7 +184,7 @@ class EdgeState:
             self.started = True
 
     def scored(self, publication: Publication, comparison: Comparison | None) -> None:
-        """Replace the publication of the same number by this one, which has scores."""
+        """Replace the publication of the same number by this scored one."""
         with self._lock:
             for i in range(len(self._publications) - 1, -1, -1):
                 if self._publications[i].number == publication.number:

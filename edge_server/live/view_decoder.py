@@ -1,7 +1,7 @@
-"""Decode buffered frames into views, as late as possible and once.
+"""Decodes buffered frames into views, as late as possible and only once.
 
-A frame is decoded only when a decision uses it. A policy may well select the same frame twice, so the decoder
-keeps the last view of each camera.
+A frame is decoded only when a decision uses it. A policy may select the same frame twice, so the decoder keeps the
+last view of each camera.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class ViewDecoder:
     most_pixels: largest number of pixels of an image; larger ones are decoded at 1/2, 1/4 or 1/8 of their
     width and height. None: images keep their size.
     undecodable: number of damaged payloads. A failure is remembered, so that a frame counts once.
-    undecodable_depth: number of frames whose depth is damaged, which costs them only the depth.
+    undecodable_depth: number of frames whose depth is damaged, which are used without it.
     """
 
     def __init__(self, foreground: Foreground | None = None, most_pixels: int | None = None) -> None:
@@ -46,7 +46,7 @@ class ViewDecoder:
         return [view for item in selected if (view := self.view(item)) is not None]
 
     def view(self, frame: Frame) -> View | None:
-        """View of one frame, kept as its camera's last; None where it cannot be decoded."""
+        """View of one frame, kept as its camera's last; None if it cannot be decoded."""
         cached = self._views.get(frame.camera)
         if cached is not None and cached[0] is frame:
             return cached[1]

@@ -26,7 +26,7 @@ class _Handler(WSGIRequestHandler):
     timeout = tuned.SCRAPE_TIMEOUT_S  # of each read of the socket
 
     def log_message(self, *_: Any) -> None:
-        """Requests are not worth a line."""
+        """Requests are not logged."""
 
 
 class _Server(ThreadingMixIn, WSGIServer):
@@ -61,7 +61,7 @@ class _Server(ThreadingMixIn, WSGIServer):
 
 
 def _read_to_its_end(connection: socket.socket) -> None:
-    """Say that the answer is complete, then read and forget what still comes, for HTTP_LINGER_S at most.
+    """Signal that the answer is complete, then read and discard further input for at most HTTP_LINGER_S.
 
     Closing with bytes unread resets the connection, and the client loses an answer that it has not read, such
     as the refusal of a body that is too large.
@@ -75,7 +75,7 @@ def _read_to_its_end(connection: socket.socket) -> None:
 
 
 def _guarded(inner: Any, door: HttpDoor) -> Any:
-    """``inner`` behind the access rules of ``door``; it finds the admitted caller at ``CALLER``."""
+    """``inner`` behind the access rules of ``door``; the environment holds the admitted caller under ``CALLER``."""
 
     def application(environ: dict[str, Any], start_response: Any) -> Any:
         try:

@@ -55,8 +55,8 @@ class Journal:
         return sum(file.lost for file in self._files.values())
 
     def begin(self) -> None:
-        """Where an earlier process, which may have published nothing, left lines, say in each file that another one
-        begins: by a line that says nothing, at 0 s."""
+        """Mark in each file with lines of an earlier process, which may have published nothing, that a new one begins:
+        by an empty line at 0 s."""
         if (self._out / "ages.jsonl").stat().st_size:
             for file in self._files.values():
                 file.write('{"t_s": 0.0, "age_ms": {}}')
@@ -90,7 +90,7 @@ class Journal:
         self._files["ages"].write(msgspec.json.encode(line).decode())
 
     def write_status(self) -> None:
-        """Replace edge.json; where that fails, the old one stays."""
+        """Replace edge.json; if that fails, the old one stays."""
         status = self._status()
         try:
             write_json(self._out / "edge.json", status)
@@ -100,7 +100,7 @@ class Journal:
             self._status_failed = True
 
     def close(self, with_status: bool = True) -> None:
-        """Write what is open, and a last status unless another run's is to stay."""
+        """Write pending lines, and a last status unless that of another run is to stay."""
         with self._lock:
             while self._open:
                 self._write_oldest()

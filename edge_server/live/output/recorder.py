@@ -1,6 +1,6 @@
-"""Writes what arrives and what is decided to a session file or ROS bag, on a thread of its own.
+"""Records arriving frames and decisions to a session file or ROS bag, on a separate thread.
 
-Callers never wait: what does not fit the bounded queue is dropped and counted.
+Callers never wait: messages that do not fit the bounded queue are dropped and counted.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ log = logging.getLogger(__name__)
 class Recorder:
     """Records one session. Thread-safe.
 
-    file: ``path``, or a numbered name beside it if that exists: MCAP if it ends so, else the folder of a ROS 2 bag.
-    written, dropped: number of messages in the file, and of those that found no room.
-    Raises OSError, and SessionError where the extra ``mcap`` or ``ros`` is missing.
+    file: ``path``, or a numbered name beside it if that exists: MCAP by its suffix, else the folder of a ROS 2 bag.
+    written, dropped: number of messages in the file, and of those that did not fit the queue.
+    Raises OSError, and SessionError if the extra ``mcap`` or ``ros`` is missing.
     """
 
     def __init__(self, path: Path, scenario: str) -> None:
@@ -72,7 +72,7 @@ class Recorder:
         return {"file": self.file.name, "written": self.written, "dropped": self.dropped, "failed": self._failed}
 
     def close(self) -> None:
-        """Write what is queued, and the index. A recording of nothing is removed: the next start takes its name."""
+        """Write queued messages and the index. An empty recording is removed: the next start takes its name."""
         with self._changed:
             self._closing = True
             self._changed.notify()
@@ -103,7 +103,7 @@ class Recorder:
                     if not self._queue:
                         if self._closing:
                             break
-                        # Callers do not wake this thread: that would cost them more than all the rest.
+                        # Callers do not wake this thread: that would cost them more than everything else here.
                         self._changed.wait(tuned.RECORD_EVERY_S)
                         continue
                     size, write = self._queue.popleft()

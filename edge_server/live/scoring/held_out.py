@@ -2,8 +2,8 @@
 
 A publication is compared with the capture nearest to the present, the instant of publication. That capture may not
 have arrived yet, so the publication waits until one at or after the present has arrived, at most half a period
-away. A camera that stands still is rendered at once, and the picture waits; of one that moves, whose pose at the
-capture is not known yet, one snapshot of the field waits.
+away. A fixed camera is rendered at once, and the rendering waits. The pose of a moving one at the capture is not known
+yet, so one snapshot of the field waits.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Image = NDArray[np.float32]
 
 @dataclass(eq=False)
 class Truth:
-    """A frame of a held-out camera. compared: with the frame before, for the noise. number: of its place so far."""
+    """A frame of a held-out camera. compared: with the frame before, for the noise. number: in ``so_far``."""
 
     frame: Frame
     compared: bool = False
@@ -48,7 +48,7 @@ class Truth:
         return self.frame.generated_edge_ns
 
     def image(self) -> NDArray[np.uint8]:
-        """The image (H, W, 3 or 4), decoded when it is first needed: 8 bits take an eighth of the metrics' float64.
+        """The image (H, W, 3 or 4), decoded on first use: 8 bits take an eighth of the metrics' float64.
         Raises PayloadError."""
         if self._image is None:
             k = self.frame.intrinsics
@@ -77,9 +77,9 @@ class Scored:
 class HeldOutCamera:
     """The history of one camera. Not thread-safe.
 
-    noisy: its frames are real video, so that the bound of moving pixels follows their noise.
+    noisy: its frames are real video, so that the threshold of moving pixels follows their noise.
     undecodable: number of damaged frames so far.
-    so_far: frames that were taken from other places than the one before, see ``fidelity.so_far``.
+    so_far: frames taken at another place than the one before, see ``fidelity.so_far``.
     """
 
     def __init__(self, camera: str, scorer: Scorer, noisy: bool = False) -> None:
@@ -93,8 +93,8 @@ class HeldOutCamera:
         self._pending: deque[tuple[Publication, Image | Snapshot, Pose]] = deque()
 
     def publish(self, publication: Publication, snapshot: Snapshot) -> list[Scored]:
-        """Let a publication wait for its truth; returns those that have theirs. It goes unscored before the camera's
-        second frame, while ``MOST_PENDING`` wait, and while another one waits for a camera that moves."""
+        """Queue a publication for its truth; returns those whose truth is known. It stays unscored before the camera's
+        second frame, while ``MOST_PENDING`` wait, and while another one waits for a moving camera."""
         if len(self.truths) < 2 or len(self._pending) == tuned.MOST_PENDING:
             return []
         newest = self.truths[-1].frame
@@ -145,7 +145,7 @@ class HeldOutCamera:
         return None if found is None else found[0]
 
     def _complete(self) -> list[Scored]:
-        """Score the waiting publications whose nearest capture is known: one at or after the present is here."""
+        """Score the waiting publications whose nearest capture is known: one at or after the present has arrived."""
         done: list[Scored] = []
         period_ns = self.period_ns()
         while period_ns and self._pending and self.truths:  # damaged ones are removed meanwhile

@@ -1,13 +1,13 @@
-"""Scores publications, and what is shown between them, on a thread of its own, so that neither ingest nor
-the field waits for it.
+"""Scores publications, and what is shown between them, on a separate thread, so that neither ingest nor the field
+waits for it.
 
 Each held-out camera compares publications with its captures (``held_out``). If scoring falls behind, publications
-stay unscored (nulls in the series) and nothing queues up: a snapshot is as large as the field, so that only those
-are kept which a capture that is still to come may ask for. The thread's own computing, without the rendering in the
-field's workers, is a bounded share of the machine's.
+stay unscored (nulls in the series) and nothing queues up. A snapshot is as large as the field, so only those are kept
+that a future capture may need. The thread's own computing, without the rendering in the field's workers, is a bounded
+share of the machine's.
 
-What was shown is scored at random captures of each held-out camera: the publication that was the newest one
-at that instant, extrapolated to it (``Snapshot.at``), as the page renders it for a visitor who moves.
+What was shown is scored at random captures of each held-out camera: the newest publication at that instant,
+extrapolated to it (``Snapshot.at``), as the page renders it for a visitor who moves.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ log = logging.getLogger(__name__)
 class ScoringThread:
     """The thread that owns the scorer.
 
-    held_out: ids of the held-out cameras; where there are none, the selected views are scored.
+    held_out: ids of the held-out cameras; if there are none, the selected views are scored.
     on_scored(publication with scores, comparison or None, final): called on this thread. final: the scores of
     all held-out cameras are in.
     on_shown(score, publication): ``score`` rates what was shown at ``score.published_ns``, ``publication``
@@ -64,7 +64,7 @@ class ScoringThread:
         self._on_shown = on_shown
         self._rng = np.random.default_rng(seed_sequence(seed, "shown"))
         self._recent: deque[tuple[Publication, Snapshot]] = deque(maxlen=tuned.MOST_SNAPSHOTS)
-        self._left_out_ns = 0  # instant of the newest publication that went by unseen
+        self._left_out_ns = 0  # instant of the newest publication that this thread skipped
         self._next_shown_ns = dict.fromkeys(self._held_out, 0)
         self._shown_count, self._shown_cost_s = 0, np.inf  # cost of the last score of what is shown, CPU s
         self._allowance_s = tuned.FIRST_ALLOWANCE_S
@@ -78,15 +78,15 @@ class ScoringThread:
         self._selected_scored = 0  # publications scored on the views learned from
         self.baselines = BaselineMean()
         self.so_far: SoFarScores | None = None
-        """Of held-out cameras that move: now, and all frames so far. At the end of a run each of these is rendered from
-        the last field; before, as many as this thread has time for."""
+        """Scores of moving held-out cameras: now, and all frames so far. At the end of a run all of these are rendered
+        from the last field; before, as many as this thread has time for."""
         self._frame_scores: dict[Truth, FrameScore] = {}
         self._looked_at = 0  # frames of ``so_far`` scored so far
-        self._ends_s = np.inf  # when ``stop`` waits no longer
+        self._ends_s = np.inf  # when ``stop`` stops waiting
         self._thread = threading.Thread(target=self._main, name="scoring", daemon=True)
 
     def load(self) -> None:
-        """Load what the metrics need: for LPIPS two seconds, in which Python runs little else."""
+        """Load what the metrics need: two seconds for LPIPS, during which Python runs little else."""
         try:
             self._scorer.warm_up()
         except Exception:  # it costs scores, not the server
@@ -133,7 +133,7 @@ class ScoringThread:
             with self._wake:
                 self._wake.wait_for(lambda: self._new_frames or self._new_publications or self._ending)
                 if self._ending and self._new_publications and self._moving():
-                    # What the last field shows of all so far counts more than one place of each that waits.
+                    # Scores of all frames so far from the last field matter more than the publications that wait.
                     self._recent.append(self._new_publications[-1][:2])
                     self._new_publications.clear()
                 published = self._new_publications.popleft() if self._new_publications else None
@@ -151,7 +151,7 @@ class ScoringThread:
                 log.exception("a publication could not be scored")
 
     def _affordable(self, reserve_s: float = 0.0) -> bool:
-        """Refill this thread's allowance with its share of the cores' time; whether more than ``reserve_s``
+        """Refill this thread's allowance with its share of the cores' time; return whether more than ``reserve_s``
         CPU seconds are left."""
         now_s, used_s = time.monotonic(), time.thread_time()
         share = tuned.SCORING_SHARE + (tuned.LOOK_BACK_SHARE if self._moving() else 0.0)
@@ -201,14 +201,14 @@ class ScoringThread:
         return any(camera.so_far for camera in self._held_out.values())
 
     def _look_back(self, whole: bool = False) -> None:
-        """Score the newest frame of each held-out camera that moves from the newest field, and of its frames so far the
-        next one in turn. whole: all of them."""
+        """For each moving held-out camera, score its newest frame and the next of its frames so far from the newest
+        field. whole: all of its frames so far."""
         known = [(camera, truth) for camera in self._held_out.values() for truth in camera.so_far]
         if not known or not self._recent:
             return
         snapshot = self._recent[-1][1]
         newest = [(camera, camera.so_far[-1]) for camera in self._held_out.values() if camera.so_far]
-        # In turn, so that where time ends those keep their score whose score is youngest.
+        # In turn: if time runs out, the frames not reached are those that were scored most recently.
         turn = [known[(self._looked_at + k) % len(known)] for k in range(len(known) if whole else 1)]
         self._looked_at += 1
         for camera, truth in [*newest, *turn]:
@@ -224,7 +224,7 @@ class ScoringThread:
             self.so_far = so_far(list(self._frame_scores.values()), self._frame_scores[last])
 
     def _forget_snapshots(self) -> None:
-        """Drop those that were replaced before the next capture at which what is shown is scored."""
+        """Drop snapshots that were replaced before the next capture at which what is shown is scored."""
         newest_ns = {name: c.truths[-1].taken_ns if c.truths else 0 for name, c in self._held_out.items()}
         since_ns = max(newest_ns.values()) - tuned.SILENT_CAMERA_NS
         next_ns = min(max(self._next_shown_ns[name], t_ns) for name, t_ns in newest_ns.items() if t_ns >= since_ns)

@@ -93,4 +93,4 @@ def test_a_scenario_names_it(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
     assert opened().depth_network.network.name == "a.onnx"
     assert "left unused" not in caplog.text
     opened(field="tensorf")
-    assert "edge.depth_network is left unused: only splat in layers" in caplog.text
+    assert "edge.depth_network is ignored: only splat in layers" in caplog.text
