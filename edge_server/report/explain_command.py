@@ -59,8 +59,8 @@ def _explain(args: argparse.Namespace) -> None:
 def _camera(asked: str | None, found: RecordedDecision, explanation: Explanation) -> str | None:
     """The camera whose image is explained; None: there are no images."""
     if asked is not None and asked not in found.images:
-        there = ", ".join(found.images) or "none: this policy looks at no pictures"
-        raise ValueError(f"--camera {asked}: no picture of it was kept; there are: {there}")
+        there = ", ".join(found.images) or "none: this policy does not use images"
+        raise ValueError(f"--camera {asked}: no image of it was kept; there are: {there}")
     if asked is not None or not found.images:
         return asked
     share = dict(zip(explanation.names, np.abs(explanation.cameras)))
@@ -78,13 +78,13 @@ def _regions(found: RecordedDecision, camera: str, asked: bool) -> NDArray[np.fl
     except ValueError as error:
         if asked:
             raise
-        print(f"edge-server explain: no regions of a picture: {error}", file=sys.stderr)
+        print(f"edge-server explain: no image regions: {error}", file=sys.stderr)
         return None
 
 
 def _embedder(found: RecordedDecision) -> EmbedImages:
     if found.embedding is None:
-        raise ValueError("the run does not say what embedded its frames: regions cannot be found")
+        raise ValueError("the run does not name the embedder of its frames: regions cannot be explained")
     from edge_server.embed import make_embedder
     from edge_server.embed.settings import EmbeddingConfig
 

@@ -6,7 +6,7 @@ from edge_server.scheduler.policy import Epoch, Policy, SelectionWindow
 
 
 class UseAll(Policy):
-    """Use all: every camera's newest frame, however old. The maximum of views, and of age."""
+    """Use all: every camera's newest frame, however old. The most views, and the highest age."""
 
     name = "all"
 
@@ -44,7 +44,7 @@ class RoundRobin(Policy):
 
 
 class RandomSubset(Policy):
-    """Every non-empty subset is equally likely, or, with a value, every subset of k cameras. A baseline that
+    """Random subset: uniform over non-empty subsets or, with a value, over subsets of k cameras. A baseline that
     the thesis's figures lack."""
 
     name = "random"
@@ -66,7 +66,7 @@ class RandomSubset(Policy):
 
 
 class AgeDriven(Policy):
-    """Age-driven: select what minimizes the mean age of the admitted set (6.35), nothing else.
+    """Age-driven: minimize only the mean age of the admitted set (6.35).
 
     The mean is smallest for the single youngest view (K_t >= 1), so the set is that view and every one of the
     same age. The comparison shows how many views a purely age-optimal scheduler gives up.
@@ -97,7 +97,7 @@ class Threshold(Policy):
 
 
 class Periodic(UseAll):
-    """Periodic: use all views, but only at multiples of a period; what most systems do today."""
+    """Periodic: use all views, but only at multiples of a period, as most systems do today."""
 
     name = "periodic"
     parameter = "period_ms"
@@ -112,7 +112,7 @@ class Periodic(UseAll):
 
 
 def freshest(epoch: Epoch, count: int) -> tuple[str, ...]:
-    """The ``count`` cameras with the youngest frames; ties go by the cameras' own order."""
+    """The ``count`` cameras with the youngest frames; ties are broken by the cameras' order."""
     order = sorted(epoch.generated_ns, key=lambda c: -epoch.generated_ns[c])
     chosen = set(order[:count])
     return tuple(c for c in epoch.generated_ns if c in chosen)

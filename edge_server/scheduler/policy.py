@@ -1,8 +1,8 @@
-"""What a policy is: it looks at a decision epoch and selects the views of the next update.
+"""The interface of policies: at each decision epoch, a policy selects the views of the next update.
 
-A decision has two halves, because a policy may wait in between: ``plan`` runs at the decision epoch and says
-how long to wait, ``select`` then picks cameras from what is in the buffer. Live and virtual time share them: both know
-only their arguments, the policy's own seeded stream, and what the policy remembers of earlier calls. A run makes one
+A decision has two halves, because a policy may wait in between: ``plan`` runs at the decision epoch and sets how long
+to wait, ``select`` then picks cameras from the buffer. Live and virtual time share them: both use only their
+arguments, the policy's seeded random stream, and what the policy remembers of earlier calls. A run makes one
 instance.
 """
 
@@ -29,14 +29,14 @@ class Observer(Protocol):
 
 @dataclass(frozen=True)
 class Epoch:
-    """What a policy may look at.
+    """The information available to a policy.
 
     now_ns: time of the decision on the edge's clock.
     number: counts the epochs; at the edge it is the number of the update to decide on.
     generated_ns, received_ns: when the newest frame of each camera was generated, and when it arrived;
     cameras that have not reported are missing.
-    state: computes the state of all cameras, with poses and embeddings, for policies that look at more than
-    ages; None where it is not available.
+    state: computes the state of all cameras, with poses and embeddings, for policies that use more than ages;
+    None if it is not available.
     """
 
     now_ns: int
@@ -53,10 +53,10 @@ class Epoch:
 class SelectionWindow:
     """The first half of a decision: when to select, and which frames qualify.
 
-    omega_ms: shown to people; None for policies without one.
+    omega_ms: for display; None for policies without one.
     wait_until_ns: earliest instant of selection; there is no latest.
     generated_after_ns, received_after_ns: only frames generated, or arrived, later qualify (omega-wait); None
-    admits all. ``select`` leaves the others out; nobody else does.
+    admits all. Only ``select`` enforces this.
     flush: abort what is in transit at the decision (virtual time only).
     """
 
@@ -107,8 +107,8 @@ class Policy:
         return SelectionWindow()
 
     def select(self, epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
-        """Cameras to use, at least one if any qualifies (K_t >= 1). Empty: keep waiting, until the next frame arrives;
-        then this is asked again.
+        """Cameras to use, at least one if any qualifies (K_t >= 1). Empty: keep waiting; ``select`` is called again
+        when the next frame arrives.
 
         epoch: of this instant. window: as planned.
         """

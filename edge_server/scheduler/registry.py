@@ -35,16 +35,16 @@ POLICIES: dict[str, tuple[type[Policy], str]] = {
 # Prefix of a learned policy: the path of a learner's checkpoint follows.
 BANDIT = "bandit:"
 
-# A live edge cannot take back what the network carries; virtual time can, to show what the thesis assumes.
+# A live edge cannot abort what the network carries; virtual time can, to show what the thesis assumes.
 VIRTUAL_ONLY = ("wait-flush",)
-# The choices shown to people.
+# The choices offered to users.
 OFFERED: tuple[str, ...] = tuple(policy for policy in POLICIES if policy not in VIRTUAL_ONLY)
 
 
 def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Policy:
     """The named policy; modules of learned policies are imported only now.
 
-    name: as in ``POLICIES``, bandit:FILE, or a class from outside (``freshfield.plugins``).
+    name: as in ``POLICIES``, bandit:FILE, or a plug-in class (``freshfield.plugins``).
     value: value of its parameter; None takes the default.
     rng: for policies that draw.
     Raises ValueError for an unknown name (the message lists the known ones), a value out of range, or a file
@@ -61,7 +61,7 @@ def make_policy(name: str, value: float | None, rng: np.random.Generator) -> Pol
         raise plugins.PluginError(f"policy {name}: {made.__name__} does not derive from edge_server.scheduler.Policy")
     policy = made(value, rng)
     if name not in POLICIES:
-        policy.name = name  # by which every other process finds it too
+        policy.name = name  # under which every other process finds it too
     return policy
 
 
@@ -80,17 +80,17 @@ def parse_policy(text: str) -> tuple[str, float | None]:
 
 
 def short_name(name: str) -> str:
-    """A policy's name for people to read: of ``bandit:FILE`` and FILE.py:CLASS without the file's folder."""
+    """A policy's name for display: ``bandit:FILE`` and FILE.py:CLASS without the file's folder."""
     if name.startswith(BANDIT):
         return BANDIT + Path(name.removeprefix(BANDIT)).name
     return plugins.short_name(name)
 
 
 def resolve_checkpoint(name: str, folder: Path) -> str:
-    """``bandit:FILE`` with FILE made absolute; any other policy's name as it is.
+    """``bandit:FILE`` with FILE made absolute; any other policy's name unchanged.
 
-    FILE is relative to ``folder``; if there is none, to the folder of the shipped scenarios, so that what is shipped
-    (``bandit:card/policy.npz``) is found from anywhere, also in an installed wheel.
+    FILE is relative to ``folder``; if it is not there, to the folder of the shipped scenarios, so that shipped policies
+    (``bandit:card/policy.npz``) are found from anywhere, also in an installed wheel.
     """
     if not name.startswith(BANDIT):
         return name
@@ -127,15 +127,15 @@ class LivePolicies:
             raise ValueError(f"policy: a name of {len(name)} characters; none has more than {MAX_POLICY_CHARS}")
         if name not in POLICIES and name not in self.offered:
             outside = name.startswith(BANDIT) or plugins.is_reference(name)
-            known = "what was learned, or is your own, is chosen at the start (--policy)"
+            known = "learned and plug-in policies can only be chosen at the start (--policy)"
             raise ValueError(f"policy {name!r}: {known if outside else 'choose one of ' + ', '.join(self.offered)}")
         return self._made(name, value)
 
     def _made(self, name: str, value: float | None) -> Policy:
-        """``make_policy``. Raises ValueError also for what only virtual time can do."""
+        """``make_policy``. Also raises ValueError for policies that need virtual time."""
         if name in VIRTUAL_ONLY:
             raise ValueError(
-                f"policy {name!r} breaks off what the network carries, which a live edge cannot: it runs in "
+                f"policy {name!r} aborts frames in the network, which a live edge cannot do: it runs in "
                 "virtual time only (edge-server simulate, edge-server study); live, use wait"
             )
         return make_policy(name, value, self._rng(name))

@@ -1,9 +1,9 @@
 """omega-wait (6.15-6.17): wait omega, then use each newest frame that was generated, or arrived, meanwhile.
 
-The horizon is (t, t + omega] and ages are taken at its end. omega = 0 uses the buffer as it is (6.34). If
-nothing qualifies at the end, the wait goes on until the first frame that does. The thesis has two readings of
-what qualifies: frames *generated* in the horizon (6.5: ``wait``), or those that *arrive* in it, however old
-(6.16 and algorithm 2: ``wait-arrived``).
+The horizon is (t, t + omega] and ages are taken at its end. omega = 0 uses the current buffer (6.34). If no frame
+qualifies at the end, the wait continues until the first one does. The thesis has two readings of what qualifies:
+frames *generated* in the horizon (6.5: ``wait``), or those that *arrive* in it, however old (6.16 and algorithm 2:
+``wait-arrived``).
 
 A frame in transit at the decision blocks a link that serves one frame at a time, though ``wait`` will not use
 it. ``wait-flush`` aborts it (6.5: "no packets are considered in transit"), and then both readings are the
@@ -51,8 +51,8 @@ class WaitFlush(Wait):
 
 
 def wait_window(now_ns: int, omega_ms: float, arrived: bool = False) -> SelectionWindow:
-    """The horizon (now, now + omega]; omega = 0 admits the buffer as it is, at once. arrived: whether frames
-    that arrive in it are admitted, rather than those generated in it."""
+    """The horizon (now, now + omega]; omega = 0 admits the current buffer at once. arrived: whether frames that
+    arrive in it are admitted, rather than those generated in it."""
     if omega_ms == 0.0:
         return SelectionWindow(omega_ms=0.0)
     until_ns = now_ns + round(omega_ms * 1e6)
@@ -62,7 +62,7 @@ def wait_window(now_ns: int, omega_ms: float, arrived: bool = False) -> Selectio
 
 
 def qualified(epoch: Epoch, window: SelectionWindow) -> tuple[str, ...]:
-    """Cameras whose newest frame falls into the window; all where it admits all."""
+    """Cameras whose newest frame falls into the window; all if it admits all."""
     if (after := window.received_after_ns) is not None:
         return tuple(c for c, received in epoch.received_ns.items() if received > after)
     after = window.generated_after_ns

@@ -1,4 +1,4 @@
-"""The scheduler that learns (thesis 5.4, 6.3): one-step decisions, rewarded by what the field then shows.
+"""The learned scheduler (thesis 5.4, 6.3): one-step decisions, rewarded by the fidelity that the field then reaches.
 
     state.py                the state that a decision is made from (5.17, 6.33), and its features for a network
     observation.py          observes the state of a buffer

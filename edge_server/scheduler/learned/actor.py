@@ -62,7 +62,7 @@ class Actor:
         return indices, d.omega_log_probabilities(np, logits)[np.arange(len(indices)), indices]
 
     def save(self, path: Path | str) -> None:
-        """Write what ``load`` needs; learning cannot resume from it. OSError where it cannot be written."""
+        """Write what ``load`` needs; learning cannot resume from it. Raises OSError if it cannot be written."""
         arrays = {f"actor.{name}": w for name, w in self.weights.items()}
         mean = np.zeros(self.spec.layout.width) if self.mean_features is None else self.mean_features
         checkpoint.save(path, {**arrays, "usual": mean}, {"spec": self.spec.as_json()}, kind=KIND)

@@ -59,7 +59,7 @@ class BanditPolicy(Policy):
 
     def _decide(self, epoch: Epoch) -> NDArray[Any]:
         if epoch.state is None:
-            raise ValueError(f"{self.name} needs to see more than ages, which is not offered here")
+            raise ValueError(f"{self.name} needs more than the ages, and only these are available here")
         actor, last = self.actor, self.last_decision  # the online trainer may replace the actor meanwhile
         hold_ns = round(actor.spec.hold_ms * 1e6)
         if hold_ns and last is not None and last.now_ns // hold_ns == epoch.now_ns // hold_ns:

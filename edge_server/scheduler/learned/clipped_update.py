@@ -1,7 +1,7 @@
 """The clipped update of PPO (5.23, 6.42): one for the schedulers and for the policy over viewpoints.
 
-An algorithm says how probable its actions are under the present weights; this steps the weights. The caller holds
-torch to one thread, so that the same arguments give the same weights bit for bit.
+The algorithm evaluates the log-probabilities of its actions under the current weights; this module steps the weights.
+The caller limits torch to one thread, so that the same arguments give the same weights bit for bit.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Acted:
 
 
 Evaluate = Callable[[torch.Tensor], tuple[torch.Tensor, torch.Tensor, torch.Tensor]]
-"""Indices (b,) -> log-probabilities of these actions under the present weights, entropies, and values V, each (b,)."""
+"""Indices (b,) -> log-probabilities of these actions under the current weights, entropies, and values V, each (b,)."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Decisions on disk, to be explained after a run: OUT/decisions/000123.npz.
+"""Stores decisions on disk, to be explained after a run: OUT/decisions/000123.npz.
 
 A file holds one decision: state, action, and the embedded frames as delivered. Each policy is written once, as
 policy-HASH.npz. Only the newest decisions that fit are kept.
@@ -123,7 +123,7 @@ def read_decision(run: Path, number: int | None = None) -> RecordedDecision:
             try:
                 images[camera] = payload.decode(arrays[f"frame.{camera}"].tobytes(), codec, width, height)
             except payload.PayloadError:
-                continue  # it was delivered damaged, so that the policy did not see it
+                continue  # it arrived damaged, so the policy did not see it
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: damaged: {error}") from None
     if number not in (None, decision.number) and not actor.spec.hold_ms:

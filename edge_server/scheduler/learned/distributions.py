@@ -1,7 +1,7 @@
-"""Distributions over actions, computed from logits so that they are exact where probabilities touch 0 and 1.
+"""Distributions over actions, computed from logits so that they are exact for probabilities near 0 and 1.
 
-A set of cameras is drawn Bernoulli each (5.20), and empty sets are redrawn (K_t >= 1). The probability of a
-set is therefore conditioned on not being empty, p(a) / (1 - prod (1 - p_i)); in logits l
+A set of cameras is drawn as one Bernoulli variable per camera (5.20), and empty sets are redrawn (K_t >= 1). The
+probability of a set is therefore conditioned on not being empty, p(a) / (1 - prod (1 - p_i)); in logits l
 
     log p(a | not empty) = sum_{i in a} l_i - log(prod_i (1 + exp l_i) - 1),
 
@@ -25,7 +25,7 @@ _TINY = 1e-12
 
 
 def set_log_probability(xp: Any, logits: Any, mask: Any, chosen: Any) -> Any:
-    """(B,) log-probability of the sets ``chosen`` (B, N), 1 or 0 a camera, given that they are not empty."""
+    """(B,) log-probability of the sets ``chosen`` (B, N), 1 or 0 per camera, given that they are not empty."""
     return (logits * chosen * mask).sum(axis=-1) - _log_odds_of_any(xp, logits, mask)
 
 

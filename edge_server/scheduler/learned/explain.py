@@ -1,12 +1,12 @@
 """Attributes a decision to the parts of the state, the cameras, and the regions of a camera's image.
 
-The explained quantity is the logit of the action: of an omega log p / (1 - p), of a set the sum of all
-cameras' own logits, for or against.
+The explained quantity is the logit of the action: for an omega log p / (1 - p), for a set the sum of the cameras'
+logits, negated for those left out.
 
 * A part's (semantics, age, pose) is its Shapley value, from all 2^3 combinations, of the difference to the logit for
   average cameras (``Actor.mean_features``), so that the shares of the parts sum to it.
-* A camera's share is how much the logit falls when that camera is an average one.
-* A region's share is how much it falls when the region is painted over and the image embedded again.
+* A camera's share is the drop of the logit when that camera is replaced by an average one.
+* A region's share is the drop of the logit when the region is painted over and the image embedded again.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from edge_server.scheduler.learned.state import State
 EmbedImages = Callable[[Sequence[NDArray[np.uint8]]], NDArray[np.float32]]
 """Images uint8 (H, W, 3) to embeddings (n, d)."""
 
-# The gray of letterboxes, opaque: detectors are used to seeing nothing in it.
+# The gray of letterboxes, opaque: detectors are trained to find nothing in it.
 _PAINT = (114, 114, 114, 255)
 
 
@@ -65,7 +65,7 @@ def explain(actor: Actor, state: State, action: Any) -> Explanation:
         logit=float(logits[0]),
         baseline_logit=float(logits[1]),
         parts=_part_shares(actor, features, baseline, action),
-        # One that has not reported is an average one already, but equal states of a batch may round differently.
+        # A camera that has not reported is average already, but equal states of a batch may round differently.
         cameras=np.where(features[:, -1] > 0, logits[0] - logits[2:], 0.0),
         names=names,
     )
@@ -97,10 +97,10 @@ def describe_action(actor: Actor, action: Any, names: Sequence[str]) -> str:
 def occlusion_map(
     actor: Actor, state: State, action: Any, camera: int, image: NDArray[np.uint8], embed: EmbedImages
 ) -> NDArray[np.float64]:
-    """(REGIONS_A_SIDE, REGIONS_A_SIDE) fall of the action's logit when a region of ``camera``'s image is painted gray:
-    positive regions spoke for the action. ValueError where the policy does not look at images."""
+    """(REGIONS_A_SIDE, REGIONS_A_SIDE) drop of the action's logit when a region of ``camera``'s image is painted gray:
+    positive regions favored the action. Raises ValueError if the policy does not use images."""
     if "semantics" not in actor.spec.layout.parts or state.embeddings is None:
-        raise ValueError("this policy looks at no pictures: no region of one can have moved it")
+        raise ValueError("this policy does not use images, so no image region can have influenced it")
     height, width = image.shape[:2]
     rows = np.linspace(0, height, tuned.REGIONS_A_SIDE + 1).astype(int)
     columns = np.linspace(0, width, tuned.REGIONS_A_SIDE + 1).astype(int)

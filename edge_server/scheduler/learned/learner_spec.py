@@ -1,4 +1,4 @@
-"""Everything that defines a learner, as data: a checkpoint carries it, a study varies it."""
+"""The specification of a learner, as data: checkpoints store it, studies vary it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edge_server.scheduler.learned.state import StateLayout, require_int
 
 Action = Literal["select", "wait", "wait-arrived", "threshold"]
 ACTIONS: tuple[Action, ...] = ("select", "wait", "wait-arrived", "threshold")
-# In files of earlier versions: what had other values once, and the one that is left.
+# Keys of earlier versions that had several values, and the only one still supported.
 _GONE = {"network": "pooled", "cameras": None, "start": 0.5}
 
 
@@ -25,7 +25,7 @@ class Spec:
     ``threshold`` choose one of ``omegas_ms`` (6.34, 6.39).
     layout: the features of a state.
     hidden: width of all layers.
-    hold_ms: a decision holds until the next multiple of it; 0: every update has one of its own.
+    hold_ms: a decision holds until the next multiple of it; 0: every update has its own decision.
     learning_rate, minibatch: of Adam's steps. max_gradient: bound of the gradient's norm (clipping).
     clip: epsilon of (5.23).
     passes: over a batch; they end early once the policy has moved by ``target_kl`` (nats).
@@ -62,7 +62,7 @@ class Spec:
         first = self.layout.width * self.hidden
         if first > tuned.MAX_FIRST_WEIGHTS:
             raise ValueError(
-                f"a first layer of {first} weights is larger than any that is trained here: a smaller dim or hidden"
+                f"a first layer of {first} weights is larger than any that is trained here: reduce dim or hidden"
             )
         if not 0.0 <= self.hold_ms < 1e9:
             raise ValueError(f"hold_ms: expected milliseconds from 0, got {self.hold_ms:g}")
@@ -78,12 +78,12 @@ class Spec:
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> Spec:
-        """ValueError for what ``as_json`` cannot have written."""
+        """Inverse of ``as_json``. Raises ValueError for data that it cannot have written."""
         try:
             values = dict(data)
             for name, only in _GONE.items():
                 if values.pop(name, only) != only:
-                    raise ValueError(f"{name}: only {only} is read; train another policy")
+                    raise ValueError(f"{name}: only {only} is supported; train a new policy")
             layout = dict(values.pop("layout"))
             for name in ("parts", "center", "spread"):
                 layout[name] = tuple(layout[name])

@@ -1,9 +1,9 @@
 """Actor and value networks as functions of weights, written once for numpy (deciding) and torch (learning).
 
-One encoder for every camera, with the mean and the maximum over the cameras that have reported as context. It
-takes any number of cameras, in any order, where the thesis has a layer over all cameras (5.5). The first argument
-``xp`` is the module, numpy or torch. All arrays are float64: the networks are tiny, and probabilities near 0 and 1
-are not lost. Activations are tanh, so that no feature can make a logit overflow.
+All cameras share one encoder, with the mean and the maximum over the cameras that have reported as context. It takes
+any number of cameras, in any order, whereas the thesis has a layer over all cameras (5.5). The first argument ``xp``
+is the module, numpy or torch. All arrays are float64: the networks are tiny, and probabilities near 0 and 1 keep
+their precision. Activations are tanh, so that no feature can make a logit overflow.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def _hidden(xp: Any, weights: Weights, features: Any, activated: bool = True) ->
 
 
 def _pooled(xp: Any, own: Any, mask: Any) -> Any:
-    """(B, 2 hidden + 1): mean and maximum over the cameras that have reported, and their number. Zeros where
-    none has."""
+    """(B, 2 hidden + 1): mean and maximum over the cameras that have reported, and their number. Zeros if none
+    has."""
     count = mask.sum(axis=1)
     mean = (own * mask).sum(axis=1) / xp.clip(count, 1.0, None)
     # A tanh is above -1, so that a camera that has not reported is never the maximum.

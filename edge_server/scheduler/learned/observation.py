@@ -1,4 +1,4 @@
-"""The state of the edge's buffer: ages and poses of the newest frames, and their embeddings if asked for."""
+"""Observes the state of the edge's buffer: ages and poses of the newest frames, and their embeddings if asked for."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Single-step PPO (5.23, algorithm 1) and contextual-bandit PPO (6.42, algorithm 2): one learner.
 
-An episode is one decision, so that Q is the reward itself and the advantage (5.24) is r - V(s), without
-discount or bootstrapping. The two algorithms differ only in the action distribution (Bernoulli a camera,
-categorical over omega), which the specification says.
+An episode is one decision, so Q is the reward itself and the advantage (5.24) is r - V(s), without discount or
+bootstrapping. The two algorithms differ only in the action distribution (Bernoulli per camera, categorical over
+omega), which the specification sets.
 
     learner = Learner(Spec("select", StateLayout(("age",))), seed=1)
     actions, logps = learner.actor.act(states, rng)
@@ -39,7 +39,7 @@ from edge_server.torch_threads import one_torch_thread
 _CONSTANT = 1e-9
 # No measured reward is larger; its square would overflow.
 _MAX_REWARD = 1e100
-# Of random numbers; of "actions" nothing is drawn any more, and a seed keeps its others.
+# Random streams. "actions" is unused, but removing it would change the others of a seed.
 _STREAMS = ("weights", "actions", "order")
 
 
@@ -48,7 +48,7 @@ class Batch:
     """Decisions and their rewards.
 
     features: (B, N, width). actions: (B, N) bool, or (B,) index of an omega. logps: (B,) log-probabilities
-    under the policy that acted. rewards: (B,), NaN where there is none.
+    under the policy that acted. rewards: (B,), NaN if missing.
     """
 
     features: NDArray[np.float64]
@@ -135,9 +135,9 @@ class Learner:
         with torch.no_grad():
             baseline = networks.value(torch, self._value, features)
         spread = rewards.std(correction=0).item()
-        # A single reward varies against those before it, which standardized it.
+        # A single reward counts as varying: it was standardized by the earlier ones.
         varies = spread > _CONSTANT or (len(rewards) == 1 and self._rewards.variance > 0.0)
-        # Where no action made a difference, only errors of V remain.
+        # If no action made a difference, only errors of V remain.
         advantages = self._normalized_advantages(rewards - baseline) if varies else torch.zeros_like(rewards)
 
         def evaluate(some: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -161,8 +161,8 @@ class Learner:
     # --- keeping ------------------------------------------------------------------------------------
 
     def save(self, path: Path | str) -> None:
-        """Write everything, so that a learner loaded from ``path`` continues bit for bit. Atomic; OSError
-        where it cannot be written."""
+        """Write everything, so that a learner loaded from ``path`` continues bit for bit. Atomic. Raises OSError if
+        it cannot be written."""
         arrays = {f"actor.{name}": w.detach().numpy() for name, w in self._actor.items()}
         arrays["usual"] = self._mean_features
         arrays |= {f"value.{name}": w.detach().numpy() for name, w in self._value.items()}

@@ -4,9 +4,9 @@
     found = reward.of(publication)          # anything with psnr_db, psnr_moving_db, ssim, lpips, aaoi_ms
     found.total, found.terms, found.missing
 
-(6.38) is r = -F_w. The thesis (6.5) prints w_s = +0.2: a better SSIM then makes F_w larger and the reward
-smaller, against (6.36)'s own purpose. The preset ``thesis`` keeps the printed sign, so that its figures can
-be repeated; ``corrected`` turns it and is the default.
+(6.38) is r = -F_w. The thesis (6.5) prints w_s = +0.2: a better SSIM then makes F_w larger and the reward smaller,
+contrary to the purpose of (6.36). The preset ``thesis`` keeps the printed sign, so that its figures can be
+reproduced; ``corrected``, the default, reverses it.
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ from edge_server.scheduler.learned import learning_constants as tuned
 class RewardTerms:
     """A reward, term by term.
 
-    total: sum of the known terms; None if none is known. Totals are comparable only where they are
-    ``complete``.
-    terms: weight times value by name; None where the metric is missing.
+    total: sum of the known terms; None if none is known. Totals are comparable only if ``complete``.
+    terms: weight times value by name; None if the metric is missing.
     """
 
     total: float | None
@@ -67,8 +66,8 @@ class Reward:
 
     def of(self, score: Any) -> RewardTerms:
         """The reward of a score, which has ``psnr_db``, ``psnr_moving_db``, ``ssim`` and ``lpips``; ``aaoi_ms`` and
-        ``views`` are read where it has them, as a publication does. A metric that it lacks, or that is None or not
-        finite, is missing."""
+        ``views`` are read if it has them, as a publication does. A metric that is absent, None or not finite counts
+        as missing."""
         psnr_db = score.psnr_db if self.fidelity == "whole" else score.psnr_moving_db
         found = {
             "psnr" if self.fidelity == "whole" else "psnr_moving": (self.psnr, psnr_db),
@@ -95,8 +94,8 @@ REWARDS = {
 
 
 def f_w(row: Mapping[str, Any]) -> dict[str, float | None]:
-    """``f_w``: F_w of (6.36) and (6.37); ``f_w_corrected``: with the sign of SSIM turned. Smaller is better. Ages in
-    slots of 1 ms; None where a metric is missing.
+    """``f_w``: F_w of (6.36) and (6.37); ``f_w_corrected``: with the sign of SSIM reversed. Smaller is better. Ages in
+    slots of 1 ms; None if a metric is missing.
 
     row: with psnr_db, ssim, lpips and aaoi_ms.
     """
@@ -106,8 +105,8 @@ def f_w(row: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def make_reward(name: str = "corrected", fidelity: str = "whole", **others: Any) -> Reward:
-    """The preset ``name`` with ``fidelity`` and other fields of ``Reward`` in place of its own. ValueError
-    for an unknown name lists the known ones."""
+    """The preset ``name``, with ``fidelity`` and other fields of ``Reward`` replaced. Raises ValueError for an unknown
+    name; the message lists the known ones."""
     if name not in REWARDS:
         raise ValueError(f"reward {name!r} is not known; choose one of {', '.join(REWARDS)}")
     return replace(REWARDS[name], fidelity=fidelity, **others)  # type: ignore[arg-type] # checked by Reward

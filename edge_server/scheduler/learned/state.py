@@ -1,4 +1,4 @@
-"""What a decision is made from: semantics, ages and poses of all cameras, s_t = [Z Delta P] (6.33).
+"""The state that a decision is made from: semantics, ages and poses of all cameras, s_t = [Z Delta P] (6.33).
 
 ``State`` holds measured values; ``StateLayout`` turns them into features for a network: always finite, the
 same scale for every part, and zeros with a cleared mask bit for a camera that never reported.
@@ -70,7 +70,7 @@ class StateLayout:
     oldest_ms: ages are clipped to it.
     center, spread: (d,) mean and standard deviation of embeddings, from ``standardized``; empty: used
     unscaled.
-    embedding: name of the embedder the policy was trained with; empty: not said.
+    embedding: name of the embedder the policy was trained with; empty: not specified.
     """
 
     parts: tuple[str, ...] = ("age", "pose", "semantics")
@@ -114,7 +114,7 @@ class StateLayout:
 
     def features(self, state: State) -> NDArray[np.float64]:
         """(N, width), finite for any state. A camera whose age is NaN counts as one that never reported.
-        ValueError where semantics are needed and the state has none, or of another width."""
+        Raises ValueError if semantics are needed and the state has none, or of another width."""
         known = state.reported & ~np.isnan(state.ages_ms)
         out = np.zeros((len(state), self.width))
         for part, columns in self.columns.items():
@@ -133,7 +133,7 @@ class StateLayout:
 
     def standardized(self, embeddings: NDArray[np.float64]) -> StateLayout:
         """The layout with which these ``embeddings`` (n, dim) have mean 0 and standard deviation 1: what all frames
-        share says nothing about a decision. Rows that are not finite are ignored; of fewer than two, itself."""
+        have in common does not inform a decision. Rows that are not finite are ignored; fewer than two change nothing."""
         rows = embeddings[np.isfinite(embeddings).all(axis=1)]
         if len(rows) < 2:
             return self
@@ -151,7 +151,7 @@ class StateLayout:
 
     def _semantics(self, state: State) -> NDArray[np.float64]:
         if state.embeddings is None:
-            raise ValueError("state: semantics are needed, but nothing computes embeddings here")
+            raise ValueError("state: semantics are needed, but embeddings are not computed here")
         if state.embeddings.shape[1] != self.dim:
             raise ValueError(f"state: embeddings of width {state.embeddings.shape[1]}, expected {self.dim}")
         z = state.embeddings.astype(np.float64)

@@ -209,5 +209,5 @@ def test_where_frames_cannot_be_embedded_again_the_rest_is_told(tmp_path, capsys
     DecisionWriter(tmp_path, None).write(a_decision(2))
     assert main([str(tmp_path)]) == 0
     told = capsys.readouterr()
-    assert "by part of the state" in told.out and "does not say what embedded" in told.err
-    assert "does not say what embedded" in refusal(capsys, main, tmp_path, "--camera", "cam01")
+    assert "by part of the state" in told.out and "does not name the embedder" in told.err
+    assert "does not name the embedder" in refusal(capsys, main, tmp_path, "--camera", "cam01")

@@ -61,7 +61,7 @@ def test_a_specification_survives_json():
     assert Spec.from_json(json.loads(json.dumps(spec.as_json()))) == spec
     assert Spec.from_json({**spec.as_json(), "network": "pooled", "cameras": None, "start": 0.5}) == spec
     for wrong in ({"network": "flat", "cameras": 4}, {"hold_ms": 10**400}):
-        refused(ValueError, r"only pooled is read|specification", Spec.from_json, {**spec.as_json(), **wrong})
+        refused(ValueError, r"only pooled is supported|specification", Spec.from_json, {**spec.as_json(), **wrong})
 
 
 def untaught(action, seed=0):
