@@ -133,7 +133,7 @@ class StateLayout:
 
     def standardized(self, embeddings: NDArray[np.float64]) -> StateLayout:
         """The layout with which these ``embeddings`` (n, dim) have mean 0 and standard deviation 1: what all frames
-        have in common does not inform a decision. Rows that are not finite are ignored; fewer than two change nothing."""
+        have in common does not inform a decision. Rows that are not finite are ignored; with fewer than two, itself."""
         rows = embeddings[np.isfinite(embeddings).all(axis=1)]
         if len(rows) < 2:
             return self
