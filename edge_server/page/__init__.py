@@ -79,7 +79,7 @@ def start_page(
         server: viser.ViserServer = _quietly(lambda: viser.ViserServer(host, port, verbose=False))
     if not guard.used:
         _quietly(server.stop)
-        raise PageError("page: this version of viser listens in another way: nothing would protect the page")
+        raise PageError("page: this version of viser listens in an unsupported way: the page would be unprotected")
     if port and server.get_port() != port:  # taken since the check: viser silently takes the next one
         _quietly(server.stop)
         raise PageError(_taken(host, port))
@@ -113,7 +113,7 @@ def start_page(
     def on_refused(connection: Any) -> None:
         for number, each in list(server._websock_server._live_connections.items()):
             if each is connection:
-                notify(server.get_clients().get(number), "Not done", "You logged in to look only.", bad=True)
+                notify(server.get_clients().get(number), "Not done", "Your login is for viewing only.", bad=True)
 
     guard.controls, guard.on_refused = server.gui._gui_input_handle_from_uuid, on_refused
     splats = SplatStream(state, lambda: scene.viewpoint)

@@ -1,8 +1,8 @@
-"""The page's protection against the network: TLS and login, checks of Host and Origin, of what visitors send,
-of their number, and of how long one may go without reading.
+"""The page's network protection: TLS and login, checks of Host and Origin and of visitors' messages, and limits on
+the number of visitors and on how long one may stop reading.
 
-viser listens with the websockets package and has no parameter for any of this. While it starts, viser's module
-(and no other) finds a ``websockets`` whose ``serve`` has the hooks of an ``AccessGuard``.
+viser listens with the websockets package and has no parameter for any of this. While viser starts, its module
+(and no other) gets a ``websockets`` whose ``serve`` has the hooks of an ``AccessGuard``.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ Process = Callable[[ServerConnection, Request], Response | None]
 
 
 class Viewpoint(msgspec.Struct, tag="ViewerCameraMessage"):
-    """viser's message about a visitor's camera. Fields that a later viser adds are for viser to judge."""
+    """viser's message about a visitor's camera. Fields that a later viser adds are left to viser to check."""
 
     wxyz: tuple[float, float, float, float]
     position: Vector
@@ -94,7 +94,7 @@ class Update(msgspec.Struct, tag="GuiUpdateMessage"):
     updates: dict[str, bool | int | float | str]
 
     def sound(self, controls: dict[str, Any]) -> bool:
-        """Whether it is a new value of one of ``controls``, of its kind and among what it offers."""
+        """Whether it is a valid new value of one of ``controls``: of its type, and one that it offers."""
         handle, value = controls.get(self.uuid), self.updates.get("value")
         if handle is None or len(self.updates) != 1 or value is None:
             return False
@@ -113,9 +113,9 @@ class AccessGuard:
     access: checks the login and the origin of requests.
     tls: for the port; None: no TLS.
     controls: the controls whose values may be set, by id.
-    looks: of each visitor, the controls that change only what that visitor sees, as ``controls``. Viewers have them.
+    looks: by visitor, the controls that change only that visitor's view, like ``controls``. Viewers may use them.
     on_refused: called with the connection of a viewer who tried to change something.
-    splats: serves those who draw splats themselves; None: nobody may.
+    splats: serves visitors whose browser draws splats itself; None: nobody may.
     The last four are set once the page has been made.
     """
 
@@ -136,13 +136,13 @@ class AccessGuard:
 
     @contextlib.contextmanager
     def before_viser(self) -> Iterator[None]:
-        """Within the context, what viser begins to serve is guarded; other servers of the process are not."""
+        """Within the context, servers that viser starts are guarded; other servers of the process are not."""
         viser_module = sys.modules[WebsockServer.__module__]
 
         def guarded(handler: Any, host: Any, port: Any, **options: Any) -> Any:
             self.used = True
             process = options.pop("process_request")
-            # A logger of its own, which passes on only what ``_worth_a_line`` lets through.
+            # A separate logger, which passes on only what ``_worth_a_line`` accepts.
             logger = logging.Logger("websockets.server")
             logger.parent = logging.getLogger(logger.name)
             logger.addFilter(self._worth_a_line)
@@ -191,7 +191,7 @@ class AccessGuard:
         self._connections[connection] = None
         if len(self._connections) > MAX_PAGE_CONNECTIONS:
             oldest = next(c for c in self._connections if c not in self.visitors)
-            del self._connections[oldest]  # at once: many may come before it hears of its end
+            del self._connections[oldest]  # at once: many may arrive before it is closed
             oldest.transport.abort()
 
     def closed(self, connection: VisitorConnection) -> None:
@@ -199,7 +199,7 @@ class AccessGuard:
         self.visitors.discard(connection)
 
     def takes(self, connection: VisitorConnection, data: str | bytes) -> bool:
-        """Whether viser may see what a visitor sent."""
+        """Whether a visitor's message may be passed on to viser."""
         try:
             message = _DECODER.decode(data if isinstance(data, bytes) else b"")
         except (msgspec.MsgspecError, RecursionError):
@@ -217,7 +217,7 @@ class AccessGuard:
         return True
 
     def acknowledges(self, data: str | bytes) -> bool:
-        """Whether what a visitor sent who draws splats is the number of a message."""
+        """Whether ``data``, from a visitor whose browser draws splats, is the number of a message."""
         return (isinstance(data, bytes) and len(data) == 4) or self._refuse("a message that visitors do not send")
 
     def _refuse(self, what: str) -> bool:
@@ -230,15 +230,15 @@ class AccessGuard:
         return False
 
     def _worth_a_line(self, record: logging.LogRecord) -> bool:
-        """Whether websockets may log a record: no line for each visitor and each refused request. Unreadable
-        requests, which anybody may send, are counted; connections that close without a request are ignored."""
+        """Whether websockets may log a record; visitors and refused requests get no line each. Malformed requests,
+        which anybody may send, are counted; connections that close without a request are ignored."""
         error = record.exc_info[1] if record.exc_info else None
         if error is None:
             return record.levelno >= logging.WARNING
-        if not isinstance(error, InvalidMessage):  # a fault of our own, which viser would not report
+        if not isinstance(error, InvalidMessage):  # a bug of ours, which viser would not report
             log.error("page: %s", record.getMessage(), exc_info=record.exc_info)
         elif not isinstance(error.__cause__, EOFError):
-            self._refuse("a request that is no GET of HTTP/1.1")
+            self._refuse("a request that is not an HTTP/1.1 GET")
         return False
 
     def _answer(self, connection: VisitorConnection, request: Request, process: Process) -> Response | None:
@@ -273,7 +273,7 @@ class AccessGuard:
             if response is not None and response.headers.get("Content-Type", "").startswith("text/html"):
                 _brand(response)
         if response is not None:
-            # The pages of others may not show ours in a frame, to have it clicked on.
+            # Other sites may not embed this page in a frame (clickjacking).
             response.headers.setdefault("Content-Security-Policy", "frame-ancestors 'self'")
             if self._access.access is not None and authorization is not None:
                 flags = "; Secure" if self._tls is not None else ""
@@ -282,7 +282,7 @@ class AccessGuard:
         return response
 
     def _known(self, request: Request, cookie: str) -> Caller | None:
-        """Who logged in before: browsers do not all send the login with a websocket."""
+        """The caller who logged in before: not all browsers send the login with a websocket."""
         for part in (_one(request, "Cookie") or "").split(";"):
             name, _, value = part.strip().partition("=")
             for role in ("viewer", "operator") if name == cookie else ():
@@ -300,9 +300,9 @@ class VisitorConnection(ServerConnection):
     def __init__(self, guard: AccessGuard, *words: Any, **more: Any) -> None:
         super().__init__(*words, **more)
         self.caller = ANYBODY
-        self.draws = False  # splats, by itself
+        self.draws = False  # whether the browser draws splats itself
         self._guard = guard
-        self._clicks = 0.0  # how many may come at once
+        self._clicks = 0.0  # current allowance of clicks
         self._clicked_s = -math.inf
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -330,7 +330,7 @@ class VisitorConnection(ServerConnection):
                 return data
 
     async def send(self, message: Any, text: bool | None = None) -> None:
-        """Send; a visitor who reads nothing for too long is disconnected, and what waits for them dropped."""
+        """Send; a visitor who reads nothing for too long is disconnected, and their pending messages are dropped."""
         try:
             async with asyncio.timeout(VISITOR_TIMEOUT_S):
                 await super().send(message, text)
@@ -347,6 +347,6 @@ def _brand(response: Response) -> None:
 
 
 def _one(request: Request, name: str) -> str | None:
-    """A header's value. One that is given twice is joined, so that it matches nothing."""
+    """A header's value. Repeated values are joined, so that they match nothing."""
     values = request.headers.get_all(name)
     return ", ".join(values) if values else None

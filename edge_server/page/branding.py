@@ -1,4 +1,4 @@
-"""The page's own title, icon and styles, in place of viser's."""
+"""The page's title, icon and styles, which replace viser's."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """The color scale of ages, for frustums, tables and the legend; readable by color-blind people.
 
-Bluish green, yellow and vermilion after Okabe and Ito's palette, on a logarithmic axis: network delays span
-decades, and what matters is whether an age is tens, hundreds or thousands of milliseconds.
+Bluish green, yellow and vermilion of Okabe and Ito's palette, on a logarithmic axis: network delays span decades, and
+what matters is whether an age is tens, hundreds or thousands of milliseconds.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PRESENT: RGB = (213, 94, 0)
 
 
 def age_color(age_ms: float | None) -> RGB:
-    """Color of an age in milliseconds, NaN like what is stale; gray for None."""
+    """Color of an age in milliseconds; NaN counts as stale, None is gray."""
     return UNKNOWN if age_ms is None else _SCALE[int(_steps(np.float64(age_ms)))]
 
 

@@ -1,6 +1,6 @@
 """The operator's controls: policy and its value, pause, reset, snapshot.
 
-A refused change becomes a notification for its sender. Everybody sees the values in force.
+A refused change becomes a notification for its sender. Everybody sees the current values.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ControlPanel:
         self.refresh()
 
     def refresh(self) -> None:
-        """Show the values in force."""
+        """Show the current values."""
         controls = self._state.controls
         with self._lock:
             shown = short_name(controls.policy)
@@ -85,7 +85,7 @@ class ControlPanel:
         entered, name = event.target.value, self._state.controls.policy
         if event.client is None or entered == _finite_or_zero(self._state.controls.value):
             return
-        # The value comes from a browser: an empty input must end as a notification too.
+        # The value comes from a browser: an empty input must result in a notification, too.
         self._attempt(event.client, f"{name} with {entered}", lambda: self._state.set_policy(name, float(entered)))
 
     async def _pressed(self, event: Any) -> None:
@@ -106,7 +106,7 @@ class ControlPanel:
         notify(client, "Snapshot saved", str(path), seconds=SNAPSHOT_NOTICE_S)
 
     def _attempt(self, client: Any, what: str, action: Any) -> None:
-        """Call ``action``; if it fails, notify the client and show the values still in force."""
+        """Call ``action``; if it fails, notify the client and show the unchanged values."""
         try:
             action()
         except Exception as error:  # any failure is shown to the operator and never ends the page
@@ -125,9 +125,9 @@ class ControlPanel:
 
 
 def add_view_choice(client: Any, order: float, renders: RenderLoop) -> None:
-    """Let a visitor, and this one alone, choose what of the scene they see. order: of the input in the panel."""
+    """Add the choice of display mode, for this visitor alone. order: of the input in the panel."""
     choice = client.gui.add_dropdown("show", VIEWS, initial_value=PICTURE, hint=HINT, order=order)
-    # The visitor's own node of this name takes the place of what all share: cameras in front of a comparison disturb.
+    # A node of the same name for this visitor replaces the shared one: frustums would obscure a comparison.
     cameras = client.scene.add_frame("/cameras", show_axes=False)
 
     def chosen(event: Any) -> None:
@@ -142,7 +142,7 @@ def _finite_or_zero(value: float | None) -> float:
 
 
 def _label(parameter: str | None) -> str:
-    """``omega_ms`` for people: omega, ms."""
+    """``omega_ms`` as a label: omega, ms."""
     if parameter is None:
         return "value"
     name, _, unit = parameter.partition("_")

@@ -1,4 +1,4 @@
-"""Whether the picture is good for nothing, and the likely cause, in words."""
+"""Diagnoses a useless picture, and names the likely cause."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edge_server.report.report_constants import TOO_SHORT
 
 
 def poor_picture(flat_db: float | None, publications: Sequence[Publication], cameras: Sequence[CameraView]) -> str:
-    """A warning where the latest pictures are no better than one mean color; otherwise empty.
+    """A warning if the latest pictures are no better than one mean color; otherwise empty.
 
     flat_db: PSNR of an image in the mean color of the training images; None: not known.
     publications: oldest first. cameras: of the run.
@@ -29,7 +29,7 @@ def poor_picture(flat_db: float | None, publications: Sequence[Publication], cam
 
 
 def _cause(cameras: Sequence[CameraView], held_out: bool) -> str:
-    """held_out: the score is on held-out views, which training cameras that share little do not show."""
+    """held_out: the score is on held-out views, which training cameras with little overlap do not cover."""
     ages_ms = [c.age_ms for c in cameras if c.age_ms is not None]
     refusing = [c.camera for c in cameras if c.rejected > REFUSED_SHARE * (c.delivered + c.rejected)]
     if len(ages_ms) < 2 <= len(cameras):

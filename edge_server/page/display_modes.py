@@ -1,4 +1,4 @@
-"""What a visitor may look at beside the picture: depth, age, truth beside rendering, and the error."""
+"""Display modes besides the picture: depth, age, truth beside rendering, and the error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from freshfield.geometry import Pinhole, seen_from, world_rays
 PICTURE, DEPTH, AGE, TRUTH, ERROR = "picture", "depth", "age", "truth | picture", "error"
 VIEWS = (PICTURE, DEPTH, AGE, TRUTH, ERROR)
 HINT = (
-    "depth: red is near, blue is far. age: of the newest frame that looks at a place; what hides it is not known. "
+    "depth: red is near, blue is far. age: of the newest frame whose camera faces a place; occlusion is ignored. "
     f"error: |truth - picture| at the held-out camera, {ERROR_GAIN:g} times brighter."
 )
 BACKDROP = np.array([18, 20, 24], np.float32) / 255
@@ -41,11 +41,10 @@ def depth_view(rendering: Rendering) -> Image:
 def age_view(
     rendering: Rendering, camera_to_world: NDArray[np.float64], lens: Pinhole, cameras: Sequence[CameraView]
 ) -> Image:
-    """Colors (H, W, 3): the age of the newest frame of a training camera that looks at each place, on the scale of the
-    legend, with the picture's light and shade; gray where none does. Occlusion is not known. Reckoned at every
-    AGE_VIEW_STEP-th pixel.
+    """Colors (H, W, 3): the age of the newest training frame that contains each place, on the scale of the legend,
+    shaded like the picture; gray where there is none. Occlusion is ignored. Computed at every AGE_VIEW_STEP-th pixel.
 
-    rendering: what ``lens`` at ``camera_to_world`` sees.
+    rendering: the view of ``lens`` at ``camera_to_world``.
     """
     small = lens.scaled(1.0 / AGE_VIEW_STEP)
     origin, directions = world_rays(small, camera_to_world)
@@ -68,10 +67,10 @@ def age_view(
 
 
 def compared(comparison: Comparison, width: int, height: int, error: bool, labeled: bool = True) -> Image:
-    """Truth and rendering of the held-out camera as large as they fit into (height, width, 3): side by side, or one
-    above the other where that is larger.
+    """Truth and rendering of the held-out camera, as large as they fit into (height, width, 3): side by side, or one
+    above the other if that is larger.
 
-    error: their absolute difference alone. labeled: the image says what is what.
+    error: their absolute difference alone. labeled: whether labels are drawn on the image.
     """
     truth = comparison.truth.astype(np.float32) / 255
     rendered = cv2.resize(comparison.rendered, truth.shape[1::-1], interpolation=cv2.INTER_NEAREST)
@@ -88,7 +87,7 @@ def compared(comparison: Comparison, width: int, height: int, error: bool, label
     labels = ("error",) if error else ("truth", "what the field renders")
     for number, words in enumerate(labels if labeled else ()):
         x, y = (number * size[0] // 2, 0) if shown is row else (0, number * size[1] // 2)
-        for color, thickness in ((0.0, 4), (1.0, 1)):  # an outline, so that it is read on any image
+        for color, thickness in ((0.0, 4), (1.0, 1)):  # an outline, so that it is readable on any image
             at = (x + LABEL_PX, y + 2 * LABEL_PX)
             cv2.putText(large, words, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (color,) * 3, thickness, cv2.LINE_AA)
     out = np.empty((height, width, 3), np.float32)

@@ -54,9 +54,8 @@ def status(s: Summary) -> str:
 
 
 def frontier(found: Frontier, present: tuple[float, float, float | None] | None) -> str:
-    """What accuracy costs in time: PSNR against the time of an update, the curves of the best setting bold,
-    and the run's own point ``present`` (``EdgeState.present``). Without measured points, how to measure
-    them."""
+    """Chart of the trade-off of accuracy against time: PSNR against update time, with the curves of the best setting
+    bold, and the run's own point ``present`` (``EdgeState.present``). Without measured points, how to measure them."""
     if not found.points:
         return html("note", f"What accuracy costs in time is not measured for this field. {found.about}")
     now = [(present[0], db) for db in present[1:] if db is not None] if present is not None else []
@@ -103,12 +102,12 @@ def decision_words(last: Publication, cameras: Sequence[CameraView], policy: str
         )
     if last.refused:
         words += f"; refuses {', '.join(last.refused)}, which contradict the others"
-    # Room for two lines, so that what is below stays where it is.
+    # Room for two lines, so that the elements below do not move.
     return str(_panel.note(f"Update {last.number} {words}.", lines=2))
 
 
 def comparison_caption(camera: str, psnr_db: float | None, update: int, held_out: bool) -> str:
-    """The caption above the pair of images. held_out: the camera is."""
+    """The caption above the pair of images. held_out: whether the camera is held out."""
     truth = "truth at the present" if held_out else NOTHING_HELD_OUT
     return str(_panel.comparison_caption(camera, psnr_db, update, truth))
 

@@ -1,6 +1,6 @@
 """The visitor's control of the network: four conditions, and sliders of delay and loss.
 
-The edge is an operator of the channel emulator, and asks it in a visitor's name. What it refuses becomes a
+The edge is an operator of the channel emulator and makes requests on a visitor's behalf. A refusal becomes a
 notification for that visitor.
 """
 
@@ -36,13 +36,13 @@ class EmulatorControl:
 
     def __init__(self, transport: Transport, address: str) -> None:
         self._transport, self._address = transport, address
-        # A certificate says who this is; a token of this server's visitors would be a wrong one there.
+        # A certificate identifies this process; the tokens of this server's visitors would be refused there.
         self._metadata = () if transport.cert is not None and transport.ca is not None else transport.metadata()
         self.in_force: Setting = None
-        """What was set here last."""
+        """The last setting made here."""
 
     def set(self, wanted: Setting) -> None:
-        """Change the network. Raises RuntimeError with what the emulator said, or that it did not answer."""
+        """Change the network. Raises RuntimeError with the emulator's refusal, or if it did not answer."""
         delay_ms, loss = wanted or (None, None)
         request = channel_pb2.SetChannelRequest(delay_ms=delay_ms, loss=loss)
         with self._transport.channel(self._address) as channel:
@@ -56,7 +56,7 @@ class EmulatorControl:
 
 
 class NetworkControl:
-    """Inputs in the current GUI container, kept equal to what is in force, which others may change too."""
+    """Inputs in the current GUI container, kept equal to the emulator's setting, which others may change too."""
 
     def __init__(self, gui: viser.GuiApi, network: EmulatorControl) -> None:
         self._network = network
@@ -74,17 +74,17 @@ class NetworkControl:
         self.refresh(None)
 
     def refresh(self, status: dict[str, Any] | None) -> None:
-        """Show what is in force. status: the emulator's; None where it is on another machine."""
-        if time.monotonic() < self._refresh_after_s:  # sliders stay where the visitor has them
+        """Show the current setting. status: the emulator's; None if it runs on another machine."""
+        if time.monotonic() < self._refresh_after_s:  # sliders stay where the visitor put them
             return
         in_force = self._network.in_force
         if status is not None and "by_hand" in status:
             try:
                 in_force = float(status["by_hand"]["delay_ms"]), float(status["by_hand"]["loss"])
-            except (KeyError, TypeError, ValueError):  # null: the scenario's; or another version's file
+            except (KeyError, TypeError, ValueError):  # null: the scenario's; or a file of another version
                 in_force = None
         self.words.content = html("note", f"The network is {describe(in_force)}.")
-        # Of the scenario's own network what is known: a slider that is moved changes the other one's value too.
+        # For the scenario's network, show what is known: moving one slider also sets the other one's value.
         self._place_sliders(*(in_force or (_drawn_ms(status), 0.0)))
 
     def _place_sliders(self, delay_ms: float, loss: float) -> None:
@@ -99,7 +99,7 @@ class NetworkControl:
         # A coroutine runs before the next click is handled, so the group still holds this click's value.
         wanted = tuned.NETWORKS.get(event.target.value)
         self._set_after(0.0, event.client, wanted)
-        # At once: a slider that is moved now sets the other one's value too.
+        # At once: moving a slider now also sets the other one's value.
         self._place_sliders(*(wanted or (float(self.delay.value), 0.0)))
 
     def _moved(self, event: Any) -> None:
@@ -107,7 +107,7 @@ class NetworkControl:
             self._set_after(tuned.SLIDER_SETTLES_S, event.client, (float(self.delay.value), self.loss.value / 100.0))
 
     def _set_after(self, seconds: float, client: Any, wanted: Setting) -> None:
-        """Set it unless another change comes first: a slider that is dragged is one change."""
+        """Set it unless another change comes first: dragging a slider is one change."""
         if self._timer is not None:
             self._timer.cancel()
         self._refresh_after_s = time.monotonic() + seconds + tuned.STATUS_LAG_S
@@ -124,7 +124,7 @@ class NetworkControl:
 
 
 def _drawn_ms(status: dict[str, Any] | None) -> float:
-    """The mean delay of the frames so far; 0 where it is not known."""
+    """The mean delay of the frames so far; 0 if it is not known."""
     try:
         found = float((status or {})["drawn_delay_ms"]["mean"])
     except (KeyError, TypeError, ValueError):

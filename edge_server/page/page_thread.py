@@ -1,4 +1,4 @@
-"""A thread of the page: it repeats a step until told to end; errors are logged and end neither it nor the server."""
+"""A thread of the page: it repeats a step until stopped; errors are logged and end neither it nor the server."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class PageThread:
             self._thread.join(timeout=tuned.THREAD_END_S)
 
     def wake(self) -> None:
-        """Begin the next step at once, also where one is at work and has looked already."""
+        """Begin the next step at once, or right after the current one."""
         with self._wake:
             self._asked = True
             self._wake.notify_all()
@@ -56,7 +56,7 @@ class PageThread:
                 self._asked = False
 
     def _say(self, error: Exception) -> None:
-        """Log an error, but not again until another one came."""
+        """Log an error, but do not repeat it until a different one occurred."""
         text = f"{type(error).__name__}: {error}"
         if text != self._last_error:
             self._last_error = text

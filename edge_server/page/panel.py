@@ -39,7 +39,7 @@ class Panel:
         self._status = gui.add_html("")
         self._decision = gui.add_html("", visible=False)
         self.view_order = self._decision.order + 0.5
-        """Of what each visitor has alone, below the status."""
+        """Of the elements that each visitor has alone, below the status."""
         self._network: NetworkControl | None = None
         if network is not None:
             with gui.add_folder("Change the network"):
@@ -58,7 +58,7 @@ class Panel:
             gui.add_html(html("legend"))
             self._table = gui.add_html("")
         with side.add_tab("Coverage"):
-            self._coverage = gui.add_html(html("note", "Reckoned once every camera has sent a frame and stands still."))
+            self._coverage = gui.add_html(html("note", "Computed once every camera has sent a frame and stands still."))
             self._places: dict[str, coverage.Camera] = {}  # of the cameras at the last refresh
             self._reckoned_for: dict[str, coverage.Camera] = {}
             self._reckoned_with_depth = False
@@ -68,7 +68,7 @@ class Panel:
         self._made_room: WeakSet[viser.ClientHandle] = WeakSet()
 
     def make_room(self, client: viser.ClientHandle) -> None:
-        """Fold up the timelines, once, of a visitor whose window is so narrow that both panels hide the scene."""
+        """Collapse the timelines, once, for a visitor whose window is so narrow that both panels hide the scene."""
         if client.camera.image_width < tuned.LEAST_SCENE_PX and client not in self._made_room:
             self._made_room.add(client)
             panel = client.gui.main_panel  # a handle that speaks to this visitor alone
@@ -86,7 +86,7 @@ class Panel:
         """Show the current state."""
         last = publications[-1] if publications else None
         self._status.content = markup.status(summary(self._state, cameras, publications))
-        learning = self._state.status_line.startswith("learning")  # what is shown is nothing yet, and that is said
+        learning = self._state.status_line.startswith("learning")  # nothing is shown yet, and the status says so
         poor = "" if learning else poor_picture(self._state.flat_db(), publications, cameras)
         troubles = [*self._state.troubles(), *([poor] if poor else [])]
         self._troubles.visible = bool(troubles)
@@ -112,7 +112,7 @@ class Panel:
             self._show_comparison(comparison, publications, held_out)
 
     def _refresh_coverage(self, cameras: Sequence[CameraView]) -> None:
-        """Reckon what the cameras see once they stand still, and again if one stands somewhere else then."""
+        """Compute the coverage once the cameras stand still, and again if one then stands elsewhere."""
         frames = {c.camera: c.newest for c in cameras if c.newest is not None}
         if not frames or len(frames) < len(cameras):
             return
@@ -143,7 +143,7 @@ class Panel:
 
 
 def _same_places(cameras: Mapping[str, coverage.Camera], others: Mapping[str, coverage.Camera]) -> bool:
-    """Whether the same cameras stand where they stood, but for the noise of their poses."""
+    """Whether the same cameras stand where they stood, up to pose noise."""
     return cameras.keys() == others.keys() and all(
         np.allclose(pose, others[name][1], atol=tuned.POSE_NOISE) for name, (_, pose) in cameras.items()
     )

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 @runtime_checkable
 class TellsUnseen(Protocol):
-    """A snapshot that knows what no camera has seen, such as ``LayeredSnapshot``."""
+    """A snapshot that knows which places no camera has seen, such as ``LayeredSnapshot``."""
 
     def unseen(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> NDArray[np.bool_] | None: ...
 
@@ -60,11 +60,11 @@ BrowserView = tuple[NDArray[np.float64], NDArray[np.float64], float, int, int]
 class ClientState:
     """A connected browser.
 
-    viewpoint: where it looks from; moved_at: when that changed.
+    viewpoint: its current viewpoint; moved_at: when that changed.
     serial: number of viewpoints so far.
     level: the finest of LEVELS sent for this viewpoint and ``renderer``, -1 for none.
     sent: number of images since the last blank background.
-    view: what of the scene is shown, one of ``display_modes.VIEWS``.
+    view: display mode, one of ``display_modes.VIEWS``.
     """
 
     client: Any
@@ -156,7 +156,7 @@ class RenderLoop(PageThread):
         return True
 
     def _compared(self, visitor: ClientState) -> Comparison | None:
-        """What a visitor who looks at truth or error sees; None for another view, and before there is a truth."""
+        """The comparison for a visitor in the view of truth or error; None for other views, and before the first."""
         return self._state.comparison if visitor.view in (display_modes.TRUTH, display_modes.ERROR) else None
 
     def _next_level(self, visitor: ClientState, renderer: Snapshot | Comparison, now: float) -> int | None:
@@ -185,7 +185,7 @@ class RenderLoop(PageThread):
                 image: NDArray[np.float32] | None = display_modes.compared(
                     shown, camera.width, camera.height, visitor.view == display_modes.ERROR
                 )
-                # A visitor who drags sees it anew, as one who moves; nothing finer will follow.
+                # A visitor who drags gets it again, like one who moves; nothing finer will follow.
                 level, levels = len(LEVELS) - 1, [MOVING, NEWER]
             else:
                 image = self._rendered(visitor, shown, level, viewpoint, serial)
@@ -207,7 +207,7 @@ class RenderLoop(PageThread):
     def _rendered(
         self, visitor: ClientState, renderer: Snapshot, level: int, viewpoint: BrowserView, serial: int
     ) -> NDArray[np.float32] | None:
-        """What a visitor looks at, from the field as it is now; None if they have moved meanwhile."""
+        """A visitor's view of the current field; None if they have moved meanwhile."""
         pose, camera = visitor_camera(*viewpoint, rows=round(self._rows[level]))
         began = perf_counter()
         shown = renderer.at(self._state.now_ns())
@@ -224,8 +224,8 @@ class RenderLoop(PageThread):
         return rendering.color
 
     def _budget_s(self, number: int) -> float:
-        """Time for an image of a level. The image of a new publication may take its share of an update: where
-        updates are short, a fine picture would be old."""
+        """Time for an image of a level. The image of a new publication may take its share of an update: with short
+        updates, a finer image would be outdated."""
         level, newest = LEVELS[number], self._state.newest()
         if number != NEWER or newest is None:
             return level.budget_s
@@ -240,8 +240,8 @@ class RenderLoop(PageThread):
     def _render(
         self, renderer: Snapshot, pose: NDArray, camera: Pinhole, visitor: ClientState, serial: int, level: int
     ) -> Rendering | None:
-        """The image, rendered in bands; None if the visitor has moved meanwhile. Every band projects the whole
-        field again, so that there are no more of them than the time of the last such image calls for."""
+        """The image, rendered in bands; None if the visitor has moved meanwhile. Every band projects the whole field
+        again, so there are only as many as the time of the last such image requires."""
         bands = max(1, round(self._took_s[level] / tuned.RENDER_BAND_S)) if level else 1
         edges = np.linspace(0, camera.height, min(bands, camera.height) + 1).astype(int)
         parts = []
@@ -253,7 +253,7 @@ class RenderLoop(PageThread):
 
 
 def hatched(image: NDArray[np.float32], unseen: NDArray[np.bool_] | None) -> NDArray[np.float32]:
-    """A rendering (H, W, 3) with dark stripes where no camera has seen what it shows.
+    """A rendering (H, W, 3) with dark stripes over places that no camera has seen.
 
     unseen: bool, at a lower resolution; None: not known.
     """

@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class _CameraNode:
-    """A camera's frustum, and what was last sent of it."""
+    """A camera's frustum, and its last sent state."""
 
     handle: Any
     pose: Pose
@@ -126,7 +126,7 @@ class Scene:
             client.camera.fov = float(2 * np.arctan(0.5 * frame.intrinsics.height / frame.intrinsics.fy))
 
     def _believed(self, frame: Frame) -> NDArray[np.float64]:
-        """Where the field believes that a frame was taken: what it shows fits the poses that it has refined."""
+        """The field's estimate of a frame's pose: its renderings fit the poses that it has refined."""
         pose, shown = frame.pose.matrix(), self._state.renderer
         if not isinstance(shown, RefinesCameras):
             return pose
@@ -135,7 +135,7 @@ class Scene:
         return pose if known is None else known.camera_to_world
 
     def _thumbnails(self, cameras: list[CameraView]) -> None:
-        """Update thumbnails within the time budget, those first that are oldest."""
+        """Update thumbnails within the time budget, oldest first."""
         began = perf_counter()
         for camera in sorted(cameras, key=lambda each: self._nodes[each.camera].thumbnail_at):
             frame, node, now = camera.newest, self._nodes[camera.camera], perf_counter()
@@ -180,7 +180,7 @@ class Scene:
             size = view.radius_m * tuned.FRUSTUM_OF_RADIUS
             for node in self._nodes.values():
                 node.handle.scale = size
-        if self._viewpoint is None:  # more cameras may report: who has come waits
+        if self._viewpoint is None:  # more cameras may report: visitors wait
             return
         for number, client in self._server.get_clients().items():
             self._place(number, client)

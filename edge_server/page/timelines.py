@@ -17,7 +17,7 @@ from edge_server.page.markup import html
 from edge_server.page.page_constants import CHART_HEIGHT_PX, CHART_LINE_PX, CHART_POINTS, CHART_SAMPLES, WINDOW_S
 
 STATE_WORDS = {"low": "good", "high": "bad"}
-"""The thesis's names of a network's states, low and high traffic, for people."""
+"""Display names of the thesis's network states, low and high traffic."""
 
 
 class History:

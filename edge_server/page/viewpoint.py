@@ -27,7 +27,7 @@ class Viewpoint:
 
 
 def initial_viewpoint(poses: ArrayLike, center: ArrayLike | None = None) -> Viewpoint:
-    """A viewpoint behind and above the cameras, looking at what they look at.
+    """A viewpoint behind and above the cameras, looking at the same point.
 
     poses: camera-to-world (N, 4, 4), N >= 1. center: the middle (3,) of the field's box, used if the optical
     axes do not meet. All values returned are finite.

@@ -1,17 +1,17 @@
 """A live server for Foxglove (extra ``foxglove``), on this machine alone: what the page shows, in Foxglove's schemas.
 
-    /CAMERA/image          CompressedImage    its newest frame, as it came; zstd becomes JPEG
+    /CAMERA/image          CompressedImage    its newest frame, as received; zstd becomes JPEG
     /CAMERA/calibration    CameraCalibration  with each frame; OpenCV's pixel origin
     /tf                    FrameTransform     world -> CAMERA, world -> rendered; axes as OpenCV's
     /truth/image           CompressedImage    the newest frame of the first held-out camera, else of the first
-    /rendered/image        CompressedImage    the field at this instant, from where that frame was taken
+    /rendered/image        CompressedImage    the field at this instant, from the pose of that frame
     /rendered/calibration  CameraCalibration
     /points                PointCloud         centers and colors of static Gaussians, where the field has any
     /ages                  JSON               seconds since the newest frame of each camera; their least and most
     /decisions             JSON               each update of the field, when published
     /scores                JSON               the same with its fidelity, when that is known
 
-Messages are made only for topics that somebody has subscribed to. Stamps are capture times on the edge's clock.
+Messages are made only for topics with subscribers. Stamps are capture times on the edge's clock.
 ``deploy/foxglove-layout.json`` is a layout to import.
 """
 
@@ -118,7 +118,7 @@ class FoxgloveServer(PageThread):
         return tuned.TICK_S
 
     def _send(self) -> None:
-        """Send what is new on the topics that somebody has subscribed to."""
+        """Send new messages on the topics with subscribers."""
         cameras = [camera for camera in self._state.cameras() if camera.newest is not None]
         seen_from = next((c for c in cameras if c.held_out), cameras[0] if cameras else None)
         fresh = [c for c in cameras if c.newest is not None and self._sent.get(c.camera) != _key(c.newest)]
@@ -139,7 +139,7 @@ class FoxgloveServer(PageThread):
             self._send_points(field)
         asked = self._images[RENDERED].has_sinks() or self._lenses[RENDERED].has_sinks()
         if asked and now_s >= self._render_due_s and seen_from is not None:
-            self._render_due_s = now_s + tuned.RENDER_EVERY_S  # also where it fails
+            self._render_due_s = now_s + tuned.RENDER_EVERY_S  # also if it fails
             self._send_rendering(field, seen_from)
             spent = perf_counter() - now_s
             self._render_due_s = now_s + max(tuned.RENDER_EVERY_S, spent / tuned.RENDER_SHARE)
@@ -237,7 +237,7 @@ class FoxgloveServer(PageThread):
 
 
 def point_cloud(field: Snapshot) -> NDArray[np.void] | None:
-    """Centers (world, meters) and colors of the static Gaussians that are seen most; None: the field has none."""
+    """Centers (world, meters) and colors of the most visible static Gaussians; None: the field has none."""
     if not isinstance(field, SplatSnapshot):
         return None
     static = field.static if isinstance(field, LayeredSnapshot) else None

@@ -58,12 +58,12 @@ class PreferencePage:
     ) -> None:
         self.session = session
         self.finished = threading.Event()
-        self.seen = threading.Event()  # whether somebody looked at the plan
+        self.seen = threading.Event()  # whether somebody viewed the plan
         self._plan: tuple[list[str], bytes] | None = None
         self._sprites, self._layout = sprites, {"frames": frames, "columns": columns}
         self._keep = keep
         self._lock = threading.Lock()
-        self._turn = secrets.token_hex(8)  # names the present state of the session; says nothing of the pair
+        self._turn = secrets.token_hex(8)  # identifies the session's current state; reveals nothing of the pair
 
     def serve(self, host: str, port: int, transport: Transport | None = None) -> tuple[str, Callable[[], None]]:
         """Serve on a thread; returns the address and a function that closes the page. Raises PageError if the
@@ -81,7 +81,7 @@ class PreferencePage:
         try:
             if method == "POST":
                 if not may_change:
-                    raise _Refused(403, "You logged in to look only.")
+                    raise _Refused(403, "Your login is for viewing only.")
                 self._change(path, _body(environ))
                 path = "/state"
             elif method != "GET":
@@ -112,7 +112,7 @@ class PreferencePage:
         return "image/jpeg", self._sprites[getattr(asked, found[1])]
 
     def state(self, session: PreferenceSession) -> dict[str, Any]:
-        """What the page knows."""
+        """The state that the page gets."""
         agreed, repeated = session.agreement
         return {
             "turn": self._turn,
@@ -128,20 +128,20 @@ class PreferencePage:
         }
 
     def show_plan(self, lines: list[str], png: bytes) -> None:
-        """Show the plan that the answers led to: what was chosen and why, and the candidates by value."""
+        """Show the plan that resulted from the answers: the choice and its reasons, and the candidates by value."""
         with self._lock:
             self._plan = lines, png
 
     def _change(self, path: str, body: bytes) -> None:
-        """Apply an answer, an undo or the end. What a tab sends about an earlier turn is refused:
-        two tabs, or two fingers, answer nothing twice."""
+        """Apply an answer, an undo or the end. Requests about an earlier turn are refused, so that two tabs or a
+        double click answer nothing twice."""
         with self._lock:
             session = self.session
             if self.finished.is_set():
                 raise _Refused(409, "The session has ended.")
             message = _message(body)
             if message.get("turn") != self._turn:
-                raise _Refused(409, "This was answered elsewhere; now see the present pair.")
+                raise _Refused(409, "This was answered elsewhere; here is the current pair.")
             if path == "/answer" and message.get("choice") in ("left", "right", "neither"):
                 if session.question is None:
                     raise _Refused(409, "All questions are answered.")
@@ -177,5 +177,5 @@ def _body(environ: dict[str, Any]) -> bytes:
     try:
         body: bytes = environ["wsgi.input"].read(int(length))
     except OSError:
-        raise _Refused(400, "The body did not come.") from None
+        raise _Refused(400, "The body did not arrive.") from None
     return body

@@ -1,4 +1,4 @@
-"""Gaussians for the visitor's browser, which draws them itself: records, messages, and what each visitor is sent.
+"""The splat stream, for browsers that draw Gaussians themselves: records, messages, and the choice of what to send.
 
 docs/splat-stream.md specifies the messages.
 """

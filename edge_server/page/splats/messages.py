@@ -1,8 +1,7 @@
-"""Messages of the splat stream, written and read (docs/splat-stream.md).
+"""Writes and reads the messages of the splat stream (docs/splat-stream.md).
 
-A message is a head (number, instant) and blocks, little endian: kind, length in bytes, content, filled up to four
-bytes. Blocks of a kind that a reader does not know are left out. ``read_message`` is the reference reader; it bounds
-all that it reads.
+A message is a head (number, instant) and blocks, little endian: kind, length in bytes, content, padded to four bytes.
+Readers skip blocks of unknown kinds. ``read_message`` is the reference reader; it bounds everything that it reads.
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ from numpy.typing import NDArray
 from edge_server.page.splats.records import RECORD, from_records
 
 VERSION = 1
-"""Of the messages. A reader refuses others."""
+"""Version of the messages. A reader refuses others."""
 MOST_ANCHORS = 255
-"""A byte names an anchor."""
+"""An anchor's index is one byte."""
 
 HEAD = struct.Struct("<Id")
 BLOCK = struct.Struct("<II")
@@ -37,14 +36,14 @@ MOST_GAUSSIANS, MOST_KNOTS = 1 << 20, 64
 
 
 class MessageError(ValueError):
-    """A message is not what docs/splat-stream.md says."""
+    """A message does not conform to docs/splat-stream.md."""
 
 
 @dataclass(frozen=True)
 class SceneBlock:
-    """What holds for all Gaussians of a field.
+    """Parameters common to all Gaussians of a field.
 
-    field: another number means another field: what was received before is void.
+    field: another number means another field, which voids everything received before.
     center_m: (3,), world meters, of the scene's origin. radius_m: a scene unit. near: scene units, from which on
     Gaussians are drawn. background: RGB (3,).
     """
@@ -60,8 +59,8 @@ class SceneBlock:
 class StaticBlock:
     """Gaussians ``first`` and following of static set ``set_number``, which has ``total``.
 
-    records: RECORD (N,). scales: log scales of bytes 0 and 255. A set is shown once all of it has come; later blocks
-    of the same set replace Gaussians one by one.
+    records: RECORD (N,). scales: log scales of bytes 0 and 255. A set is shown once it is complete; later blocks of
+    the same set replace Gaussians one by one.
     """
 
     set_number: int
@@ -73,8 +72,8 @@ class StaticBlock:
 
 @dataclass(frozen=True)
 class MovingBlock:
-    """The moving set, as a whole. records: RECORD (N,), where displacements are 0. anchor: uint8 (N, 3). share: uint8
-    (N, 2), of 255, of the first two; the third has the rest. anchors: number of the set of anchors, see KnotsBlock."""
+    """The whole moving set. records: RECORD (N,), at zero displacement. anchor: uint8 (N, 3). share: uint8 (N, 2), of
+    255, weights of the first two anchors; the third has the rest. anchors: number of the anchor set, see KnotsBlock."""
 
     anchors: int
     scales: tuple[float, float]
@@ -87,8 +86,8 @@ class MovingBlock:
 class KnotsBlock:
     """Displacements of the anchors at the newest knots.
 
-    anchors: number of the set of anchors: moving sets with another number are not moved by these.
-    first_s: instant of the first knot; those that follow are 1 / knots_per_s apart. newest_s: instant of the newest
+    anchors: number of the anchor set; these knots do not apply to moving sets with another number.
+    first_s: instant of the first knot; the others follow 1 / knots_per_s apart. newest_s: instant of the newest
     frame; nothing is shown more than ahead_s after it. Instants are seconds since the run began.
     displacements: float32 (K, A, 3), scene units.
     """
@@ -103,7 +102,7 @@ class KnotsBlock:
 
 @dataclass(frozen=True)
 class UnseenBlock:
-    """bits: bool (N,), which Gaussians of static set ``set_number`` stand where no camera has measured anything."""
+    """bits: bool (N,), which Gaussians of static set ``set_number`` are at places where no camera measured anything."""
 
     set_number: int
     bits: NDArray[np.bool_]
@@ -121,13 +120,13 @@ Block = SceneBlock | StaticBlock | MovingBlock | KnotsBlock | UnseenBlock | Stat
 
 def write_message(number: int, instant_s: float, blocks: Iterable[Block | bytes]) -> bytes:
     """A message. number: counts from 0, modulo 2^32. instant_s: the edge's present, seconds since the run began.
-    blocks: or what ``write_block`` made of them."""
+    blocks: as objects, or as ``write_block`` encoded them."""
     written = (block if isinstance(block, bytes) else write_block(block) for block in blocks)
     return HEAD.pack(number & 0xFFFFFFFF, instant_s) + b"".join(written)
 
 
 def write_block(block: Block) -> bytes:
-    """A block with its head."""
+    """Encode a block with its head."""
     kind, content = _content(block)
     return BLOCK.pack(kind, len(content)) + content + bytes(-len(content) % 4)
 
@@ -267,7 +266,7 @@ def _length(content: bytes, wanted: int) -> None:
 
 
 def read_saved(data: bytes) -> Iterator[tuple[float, bytes]]:
-    """The messages of a saved stream, each with the second at which it came. Ends where the file is cut off."""
+    """The messages of a saved stream, each with its arrival time in seconds. Ends where the file is truncated."""
     at = 0
     while at + SAVED.size <= len(data):
         size, came_s = SAVED.unpack_from(data, at)
@@ -279,7 +278,7 @@ def read_saved(data: bytes) -> Iterator[tuple[float, bytes]]:
 
 
 class StreamReader:
-    """What a browser would show after the messages read so far: the reference for other readers.
+    """The state of a browser after the messages read so far: the reference for other readers.
 
     scene: None before the first. instant_s: of the newest message, the edge's present. params: see ``at``.
     """
@@ -296,7 +295,7 @@ class StreamReader:
         self._knots: KnotsBlock | None = None
 
     def read(self, data: bytes) -> None:
-        """Take a message in. Raises MessageError; what was read before stays."""
+        """Process a message. Raises MessageError; the state from earlier messages stays."""
         _, self.instant_s, blocks = read_message(data)
         for block in blocks:
             if isinstance(block, SceneBlock):

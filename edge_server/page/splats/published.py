@@ -1,4 +1,4 @@
-"""What the field has published, as records: made once for all visitors."""
+"""Encodes the field's publications as records, once for all visitors."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from edge_server.page.splats.records import scale_range, to_records, weights
 
 @dataclass(frozen=True)
 class StaticRecords:
-    """The static Gaussians, those of largest weight first.
+    """The static Gaussians, largest weight first.
 
-    number: counts sets of other Gaussians; within one, row k stays the same Gaussian.
+    number: counts sets of different Gaussians; within a set, row k stays the same Gaussian.
     records: RECORD (N,). weight: float64 (N,). unseen: bool (N,), see
     ``SurfaceScene.unseen_points``; None without depth.
     """
@@ -36,8 +36,7 @@ class StaticRecords:
 
 @dataclass(frozen=True)
 class Published:
-    """A publication. serial: counts them. moving: those of largest weight first; None, and knots None, where nothing
-    moves."""
+    """A publication. serial: counts publications. moving: largest weight first; None if nothing moves, like knots."""
 
     serial: int
     scene: SceneBlock
@@ -116,7 +115,7 @@ class Publisher:
         return made
 
     def _same(self, params: NDArray[np.float32]) -> bool:
-        """Whether these are the Gaussians of the last set, trained on: others came, went or changed places else."""
+        """Whether these are the Gaussians of the last set, trained further: none was added, removed or reordered."""
         if len(params) != len(self._order):
             return False
         places = params[:: max(len(params) // tuned.SAMPLED, 1), :3]

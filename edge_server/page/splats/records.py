@@ -1,6 +1,6 @@
-"""Gaussians in 16 bytes each: what a browser's shader reads as it arrives.
+"""Encodes Gaussians in 16 bytes each, which a browser's shader reads without conversion.
 
-An ellipsoid does not change when its axes are renamed or reversed. Of the 24 rotations that do so, one brings its
+An ellipsoid does not change when its axes are permuted or reversed. Of the 24 rotations that do so, one brings its
 quaternion into the fundamental zone of cubic symmetry (Heinz and Neumann 1991), in which no component of the Rodrigues
 vector, axis times tan(angle / 2), exceeds sqrt(2) - 1. Three bytes then hold a rotation to .2 degrees (RMS).
 """
@@ -35,7 +35,7 @@ def expand(places: NDArray) -> NDArray:
 
 
 def scale_range(params: NDArray[np.float32]) -> tuple[float, float]:
-    """Lowest and highest log scale of Gaussians (N, >= 14), as far as they are drawn; a range that is not empty."""
+    """Lowest and highest log scale of the Gaussians (N, >= 14) that are drawn; a non-empty range."""
     scales = params[:, SCALE:QUATERNION]
     scales = scales[np.isfinite(scales)].clip(LOG_SCALE_LOW, LOG_SCALE_HIGH)
     low, high = (float(scales.min()), float(scales.max())) if scales.size else (-1.0, 0.0)
@@ -43,8 +43,8 @@ def scale_range(params: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def to_records(params: NDArray[np.float32], scales: tuple[float, float]) -> NDArray[np.void]:
-    """RECORD (N,) of Gaussians, float32 (N, >= 14), scene units; harmonics are left out. One that is not finite, which
-    no renderer draws, gets alpha 0. scales: log scales of bytes 0 and 255; others are clipped."""
+    """RECORD (N,) of Gaussians, float32 (N, >= 14), scene units, without harmonics. Gaussians that are not finite,
+    which no renderer draws, get alpha 0. scales: log scales of bytes 0 and 255; others are clipped."""
     out = np.zeros(len(params), RECORD)
     sound = np.asarray(np.isfinite(params[:, :BASE]).all(axis=1))
     params = np.where(sound[:, None], params[:, :BASE], np.float32(0.0))
@@ -61,8 +61,8 @@ def to_records(params: NDArray[np.float32], scales: tuple[float, float]) -> NDAr
 
 
 def from_records(records: NDArray[np.void], scales: tuple[float, float]) -> NDArray[np.float32]:
-    """Gaussians, float32 (N, 14), that draw as the records do: the inverse of ``to_records`` up to rounding and the
-    names of axes."""
+    """Gaussians, float32 (N, 14), that render like the records: the inverse of ``to_records`` up to rounding and the
+    order of axes."""
     out = np.zeros((len(records), BASE), np.float32)
     low, high = scales
     out[:, POSITION:SCALE] = expand(records["place"] * PLACE_STEP - 2.0)
@@ -76,8 +76,8 @@ def from_records(records: NDArray[np.void], scales: tuple[float, float]) -> NDAr
 
 
 def weights(params: NDArray[np.float32]) -> NDArray[np.float64]:
-    """How much of a picture each Gaussian (N, >= 14) takes: area of its two longest axes times opacity, by the square
-    of its distance from the middle, where that is beyond the box. 0 for one that is not finite."""
+    """Visual weight of each Gaussian (N, >= 14): area of its two longest axes times opacity, outside the box divided by
+    the squared distance from the center. 0 for one that is not finite."""
     scales = np.sort(params[:, SCALE:QUATERNION].clip(LOG_SCALE_LOW, LOG_SCALE_HIGH).astype(np.float64), axis=1)
     raw = np.clip(params[:, OPACITY].astype(np.float64), -RAW_OPACITY_LIMIT, RAW_OPACITY_LIMIT)
     far = np.maximum(np.linalg.norm(params[:, POSITION:SCALE].astype(np.float64), axis=1), 1.0)
@@ -86,8 +86,8 @@ def weights(params: NDArray[np.float32]) -> NDArray[np.float64]:
 
 
 def noticeable(before: NDArray[np.void], now: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Which records (N,) differ by more than is seen: three steps of a place (.2 mm a meter of the scene's radius),
-    scale, alpha; two of a color; six of a turn."""
+    """Which records (N,) differ visibly: by more than three steps of position (.2 mm per meter of the scene's radius),
+    scale or alpha; two of color; six of rotation."""
     changed = np.zeros(len(now), np.bool_)
     for name, steps in (("place", 3), ("scale", 3), ("turn", 6), ("color", 2), ("alpha", 3)):
         apart = np.abs(now[name].astype(np.int32) - before[name]) > steps

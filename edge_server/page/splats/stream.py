@@ -1,7 +1,7 @@
 """Serves the splat stream and the page that draws it, on the port of the live page and behind the same guard.
 
-One thread looks at what was published and composes what each visitor is sent; the connections' own event loop sends
-it. Nothing is computed while nobody watches.
+One thread polls publications and composes each visitor's messages; the event loop of the connections sends them.
+Nothing is computed without visitors.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _POLICY = (
 
 
 def file_response(path: str) -> Response | None:
-    """A file of the page; None: there is no such one. path: of the request."""
+    """A file of the page; None if it does not exist. path: of the request."""
     path = path.partition("?")[0]
     if path == PATH.rstrip("/"):
         return Response(301, "Moved Permanently", Headers({"Location": "splats/", "Content-Length": "0"}), b"")
@@ -69,7 +69,7 @@ def file_response(path: str) -> Response | None:
 
 @dataclass(eq=False)
 class _Connected:
-    """A visitor, their event loop, and what waits to be sent."""
+    """A visitor, their event loop, and their queue of messages."""
 
     loop: asyncio.AbstractEventLoop
     visitor: Visitor
@@ -131,7 +131,7 @@ class SplatStream(PageThread):
         published = None if snapshot is None else self._publisher.take(snapshot, monotonic())
         status = self._status(snapshot is not None and published is None)
         for each in connected:
-            if not each.queue.empty():  # what an acknowledgement says, the connection has not taken yet
+            if not each.queue.empty():  # the connection has not taken the last message yet
                 continue
             with each.lock:
                 data = each.visitor.message(published, self._state.now_s(), status, monotonic())
@@ -140,7 +140,7 @@ class SplatStream(PageThread):
                     each.loop.call_soon_threadsafe(each.queue.put_nowait, data)
 
     def _status(self, other: bool) -> dict[str, Any]:
-        """What all visitors are told. other: the field does not consist of Gaussians."""
+        """The status for all visitors. other: the field does not consist of Gaussians."""
         state, newest = self._state, self._state.newest(scored=True)
         line = state.status_line
         if other:

@@ -1,9 +1,9 @@
-"""What one visitor is sent, and when: never more than their link takes.
+"""Decides what to send to one visitor, and when: never more than their link can carry.
 
-The window of bytes under way follows delay, as in LEDBAT (RFC 6817): a link whose round trips grow with what is under
-way is full. A link whose delays scatter by themselves is sent few large messages. What does not fit is left out in
-this order: small Gaussians, static sets that changed little, moving sets; knots, which move what is there already,
-come last.
+The window of bytes in flight follows delay, as in LEDBAT (RFC 6817): a link is full if its round trips grow with the
+bytes in flight. A link whose delays scatter by themselves gets few large messages. What does not fit is left out in
+this order: small Gaussians, static sets that changed little, moving sets, and last knots, which move Gaussians that
+the visitor already has.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ EMPTY = MovingBlock(0, (-1.0, 0.0), np.zeros(0, RECORD), np.zeros((0, 3), np.uin
 
 
 class LinkWindow:
-    """Bytes that may be under way, from the delays of what was acknowledged.
+    """The window of bytes in flight, from the delays of acknowledged messages.
 
-    Round trips are fitted, by least squares, by a time that a message takes alone and a time for each byte under way:
-    what they take alone may scatter, what bytes add to it is a queue. The newest count most.
+    Round trips are fitted, by least squares, by a base time per message and a time per byte in flight: the base may
+    scatter, what bytes add is a queue. The newest count most.
 
-    short: whether there was more to send than the window took.
+    short: whether there was more to send than the window allowed.
     """
 
     def __init__(self) -> None:
@@ -45,11 +45,11 @@ class LinkWindow:
         self.window = float(tuned.FIRST_WINDOW)
         self.under_way = 0
         self.rate_bytes_per_s = 0.0
-        self._sent: deque[tuple[int, int, float, int]] = deque()  # number, bytes, when, bytes under way then
+        self._sent: deque[tuple[int, int, float, int]] = deque()  # number, bytes, when, bytes in flight then
         self._round_trips: deque[tuple[float, float]] = deque()  # when, seconds
         self._moments = np.zeros(5)  # weighted sums of 1, bytes, seconds, bytes^2, bytes * seconds
-        self.round_trip_s = 0.0  # the shortest of late
-        self.alone_s, self._per_byte_s = 0.0, 1e-12  # that a message takes alone, on average, and each byte beside it
+        self.round_trip_s = 0.0  # the shortest recent one
+        self.alone_s, self._per_byte_s = 0.0, 1e-12  # fitted base time of a message, and time per byte in flight
         self._since_s, self._acknowledged = 0.0, 0
 
     @property
@@ -59,26 +59,26 @@ class LinkWindow:
 
     @property
     def room(self) -> int:
-        """Bytes that may be sent now; of a link that scatters, in a few large messages."""
+        """Bytes that may be sent now; on a link that scatters, in a few large messages."""
         if self.scatters and len(self._sent) >= tuned.SCATTERING_UNDER_WAY:
             return 0
         return min(max(int(self.window) - self.under_way, 0), self.share if self.scatters else tuned.MOST_WINDOW)
 
     @property
     def share(self) -> int:
-        """Bytes of a message with what stands still: round trips tell something only where what is under way varies."""
+        """Bytes of a message with static Gaussians: the fit needs a varying number of bytes in flight."""
         share = int(self.window) // (tuned.SCATTERING_UNDER_WAY if self.scatters else tuned.UNDER_WAY)
         return max(min(share, tuned.MOST_MESSAGE), tuned.LEAST_MESSAGE)
 
     def sent(self, number: int, size: int, now_s: float) -> None:
-        """Note a message of so many bytes."""
+        """Record a sent message of ``size`` bytes."""
         if not self._sent and not self._acknowledged:
             self._since_s = now_s
         self.under_way += size
         self._sent.append((number, size, now_s, self.under_way))
 
     def acknowledged(self, number: int, now_s: float) -> None:
-        """Note that the visitor has read all messages up to this one. A number that was not sent changes nothing."""
+        """Record that the visitor has read all messages up to this one. Unknown numbers are ignored."""
         if not any(sent == number for sent, *_ in self._sent):
             return
         size, sent = 0, -1
@@ -94,8 +94,8 @@ class LinkWindow:
         self._fit_window(size, under_way, now_s - sent_s)
 
     def _fit_window(self, size: int, under_way: int, round_trip_s: float) -> None:
-        """Fit the window to the newest round trip, of a message with which so many bytes were under way; it brought an
-        acknowledgement of ``size`` bytes."""
+        """Fit the window to the newest round trip, that of a message with ``under_way`` bytes in flight, whose
+        acknowledgement covered ``size`` bytes."""
         if self._moments[0]:  # an outage is none of the link's usual delays
             round_trip_s = min(round_trip_s, tuned.OUTAGE * max(self._moments[2] / self._moments[0], tuned.QUEUE_S))
         newest = np.array([1.0, under_way, round_trip_s, under_way**2, under_way * round_trip_s])
@@ -122,7 +122,7 @@ class LinkWindow:
 
     @property
     def bound_bytes_per_s(self) -> float:
-        """What the link takes, and no more than the window in the time that one message takes alone, and a queue."""
+        """Bound on the rate: what the link carries, and at most the window per base time of a message plus QUEUE_S."""
         within_s = self.alone_s + tuned.QUEUE_S if self._round_trips else 1.0
         return min(self.window / within_s, 1.0 / self._per_byte_s)
 
@@ -205,7 +205,7 @@ class Visitor:
         due = moving is not self._whole and now_s >= self._moving_s
         cut = self._cut(moving, room - sum(map(len, blocks))) if others or due else None
         if others and (cut is None or not blocks):
-            return []  # knots of other anchors move nothing that is there: with their moving set, or not at all
+            return []  # knots of other anchors apply to nothing that the visitor has: send them with their moving set
         if blocks:
             self._serial, self._anchors = published.serial, knots.anchors
         if cut is not None:
@@ -217,7 +217,7 @@ class Visitor:
         return blocks
 
     def _nothing_moves(self) -> list[bytes]:
-        """An empty set, once, in place of what moved."""
+        """An empty set, once, to replace the last moving set."""
         if self._anchors < 0:
             return []
         self._anchors, self._whole = -1, None
@@ -232,7 +232,7 @@ class Visitor:
         }
 
     def _cut(self, moving: MovingBlock, room: int) -> MovingBlock | None:
-        """The moving set's largest Gaussians, as many as the link takes in time; None: not now."""
+        """The moving set's largest Gaussians, as many as the link can carry in time; None: not now."""
         link = self.link
         takes = room if link.scatters else link.bound_bytes_per_s * tuned.MOVING_EVERY_S
         count = min(len(moving.records), max(int(tuned.MOVING_SHARE * takes) // _MOVING_BYTES, tuned.LEAST_MOVING))
@@ -267,7 +267,7 @@ class Visitor:
         return blocks
 
     def _newly_unseen(self) -> list[bytes]:
-        """What no camera has seen, once all records are known."""
+        """Which Gaussians no camera has seen, once the visitor has all records."""
         static = self._source
         if static is None or static.unseen is None or static.unseen is self._unseen or not self._known.all():
             return []
@@ -278,13 +278,13 @@ class Visitor:
         return self._source is not None and newest.number == self._source.number
 
     def _takes(self) -> int:
-        """Static Gaussians that the link takes in the time of a new set."""
+        """Number of static Gaussians that the link can carry in the time of a new set."""
         return int(tuned.NEW_SET_S * self.link.bound_bytes_per_s) // RECORD.itemsize
 
     def _take(self, newest: StaticRecords, wider: bool) -> None:
-        """Find what of the newest records is to be sent: chunks that have changed, those with most weight in what
-        changed first; or a set anew, its largest Gaussians alone if the link does not take all. wider: anew, because
-        the link takes more than it did."""
+        """Choose what to send of the newest records: changed chunks, ordered by the weight of what changed; or a whole
+        new set, of its largest Gaussians if the link cannot carry all. wider: send a new set, because the link can now
+        carry more."""
         if not self._same(newest) or wider:
             count = min(len(newest.records), max(self._takes(), tuned.CHUNK))
             self._set += 1

@@ -201,7 +201,7 @@ def test_a_flood_of_refused_requests_and_visitors_is_counted_and_said_once_a_min
                 with contextlib.suppress(ConnectionResetError):
                     assert not raw.recv(100)
         expected = {"requests with status 401": 10, "requests with status 403": 10, "visitors beyond 1": 10}
-        expected["a request that is no GET of HTTP/1.1"] = 10
+        expected["a request that is not an HTTP/1.1 GET"] = 10
         wait_until(lambda: refused(guard) == expected, lambda: str(guard.refused))
         # The first says what is open.
         said = [r.getMessage() for r in caplog.records if r.name.startswith(("edge_server", "websockets"))]
