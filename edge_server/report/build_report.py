@@ -20,8 +20,8 @@ from freshfield.machine_load import outside_load
 def build_report(out_dir: str | Path) -> dict[str, Any]:
     """Write report.json, report.html and PNGs into the run's folder; returns what report.json holds.
 
-    Works on what is there: after a kill, without the files of other machines, without a channel. ``notes``
-    says what was missing. Raises FileNotFoundError if the folder does not exist.
+    Works with whatever files exist: after a kill, without the files of other machines, without a channel. ``notes``
+    lists what was missing. Raises FileNotFoundError if the folder does not exist.
     """
     # Lazy: only the figures need matplotlib.
     from edge_server.report.figures import draw_all
@@ -38,7 +38,7 @@ def build_report(out_dir: str | Path) -> dict[str, Any]:
 
 def assemble(files: RunFiles) -> dict[str, Any]:
     """The contents of report.json. ``kind``: live, or fit for a recorded data set without a network, whose
-    frames, ages and channel are None; or simulated, in virtual time. ``run``: facts that the run wrote down itself."""
+    frames, ages and channel are None; or simulated, in virtual time. ``run``: facts that the run recorded itself."""
     edge, series = files.edge, files.series
     notes = list(files.notes)
     if edge.lines_lost:

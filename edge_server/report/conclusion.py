@@ -18,7 +18,7 @@ def conclusion(report: Report) -> list[str]:
         return [sentence for sentence in (_shown(report), _fitted(report)) if sentence]
     if not report["updates"]["count"]:
         if report["scenario"] is None:  # ledgers of several machines, joined in a folder of their own
-            return ["What was shown is not known: the edge's own files are not in this folder.", *_delivery(report)]
+            return ["What was shown is not known: the edge's files are not in this folder.", *_delivery(report)]
         return ["Nothing was shown: the field was never updated.", *_delivery(report)]
     return [sentence for sentence in (_shown(report), _age(report), _limit(report)) if sentence]
 
@@ -34,7 +34,7 @@ def _shown(report: Report) -> str:
             f"The newest held-out frame read {db:.1f} dB, all {so_far['frames']} so far {so_far['all_psnr_db']:.1f} dB"
         )
     elif db is None:
-        text = f"How good the picture was is not known: nothing was scored in the {FINAL_PART} of the run"
+        text = f"The fidelity is not known: nothing was scored in the {FINAL_PART} of the run"
         newest = next((row for row in reversed(fidelity["series"]) if row["psnr_db"] is not None), None)
         earlier = f"; the newest score, {newest['psnr_db']:.1f} dB, is of second {newest['t_s']:.0f}" if newest else ""
         return f"{text}{earlier}."
@@ -118,8 +118,8 @@ def _limit(report: Report) -> str:
 
 
 def _delivery(report: Report) -> list[str]:
-    """What share of the frames the network and the edge left out, and of updates that learned nothing, in one
-    sentence; empty where none is worth a word."""
+    """The shares of frames that the network and the edge left out, and of updates without training, in one sentence;
+    empty if all are negligible."""
     frames, updates = report["frames"] or {}, report["updates"]
     sent, delivered = frames.get("sent") or 0, frames.get("delivered") or 0
     undelivered = sum(frames.get(name) or 0 for name in ("dropped_busy", "superseded", "lost", "skipped", "broken"))

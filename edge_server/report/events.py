@@ -1,4 +1,4 @@
-"""What happened during a run besides updates: marked on every curve over time, and listed."""
+"""The events of a run besides its updates: marked on every curve over time, and listed."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from edge_server.run_records import AgesRow, ChannelChange, Event
 
 def events(files: RunFiles) -> list[dict[str, Any]]:
     """[{t_s: seconds since the edge started, what: in words}], in order; the ``MOST_EVENTS`` first."""
-    restarted_s = files.restarts_s[-1] if files.restarts_s else 0.0  # the edge's times and start are the last one's
+    restarted_s = files.restarts_s[-1] if files.restarts_s else 0.0  # the edge's times count from its last start
     found = [Event(event.t_s + restarted_s, event.what) for event in files.edge.events]
     if (began_ns := files.edge.started_ns) is not None:
         starts = list(zip([0.0, *files.restarts_s][::-1], _starts_ns(files.out, began_ns)))  # the last one's first
         found += [Event(_placed_s(each.at_ns, starts), _words(each)) for each in files.channel.changes]
-    found += [Event(t_s, "the edge server started again") for t_s in files.restarts_s]
+    found += [Event(t_s, "the edge server restarted") for t_s in files.restarts_s]
     found += silences(files.ages)
     found = sorted((event for event in found if event.t_s >= 0.0), key=lambda event: event.t_s)
     return [{"t_s": round(event.t_s, 2), "what": event.what} for event in found[:MOST_EVENTS]]
 
 
 def _starts_ns(out: Path, last_ns: int) -> list[int]:
-    """When each process of the edge that served started, as its ledger is called; the last one first."""
+    """Start times of the edge processes that served, from the names of their ledgers; the last one first."""
     found = {int(ns) for path in out.glob("ledger-edge-edge-*.tsv") if (ns := path.stem.rpartition("-")[2]).isdecimal()}
     return [last_ns, *sorted((ns for ns in found if ns < last_ns), reverse=True)]
 
 
 def _placed_s(at_ns: int, starts: Sequence[tuple[float, int]]) -> float:
-    """Seconds since the edge first started. starts: of its processes, in such seconds and on the clock of ``at_ns``,
-    the last one first; while none ran, no time passes."""
+    """Seconds since the edge first started, not counting the time between processes. starts: of its processes, in such
+    seconds and on the clock of ``at_ns``, the last one first."""
     placed_s = next_s = math.inf
     for start_s, start_ns in starts:
         placed_s = min(start_s + (at_ns - start_ns) / 1e9, next_s)
@@ -45,7 +45,7 @@ def _placed_s(at_ns: int, starts: Sequence[tuple[float, int]]) -> float:
 
 
 def silences(rows: Sequence[AgesRow]) -> list[Event]:
-    """When cameras stopped to deliver frames for more than ``SILENT_MS``, and for how long."""
+    """When cameras delivered no frames for more than ``SILENT_MS``, and for how long."""
     cameras = sorted({camera for row in rows for camera in row.age_ms})
     gaps = sorted((gap for camera in cameras for gap in _gaps(rows, camera)), key=lambda gap: gap[0])
     found = []

@@ -1,4 +1,4 @@
-"""``edge-server explain``: what moved a recorded decision of a learned policy."""
+"""``edge-server explain``: explains a recorded decision of a learned policy."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Explain a decision of a learned policy (bandit:FILE): shares of the state's part
 
 A run keeps its newest decisions in RUN/decisions, and so does edge-server simulate with --out.
 Parts of the state have Shapley values of the action's logit, relative to the average camera in training: they
-sum to the difference. A camera's share is what the logit falls where it is an average one.
+sum to the difference. A camera's share is the drop of the logit if it is replaced by an average one.
 Shares of regions are found by occluding them and embedding the image again; that needs a policy with
 embeddings in its state.
 """

@@ -1,4 +1,4 @@
-"""The figures of a report, one function each. A function returns False where its data are missing."""
+"""The figures of a report, one function each. A function returns False if its data are missing."""
 
 from __future__ import annotations
 
@@ -219,8 +219,8 @@ def draw_processes(report: Report, files: RunFiles, path: Path) -> bool:
 
 
 def draw_frontier(report: Report, files: RunFiles, path: Path) -> bool:
-    """What accuracy costs in time, as measured (OUT/frontier.json), and the run's own point: PSNR of what it
-    showed in its last fifth, against the time from one update to the next."""
+    """The measured trade-off of accuracy against time (OUT/frontier.json), and the run's own point: PSNR as shown in
+    its last fifth, against the time from one update to the next."""
     measured, shown = files.frontier, report["fidelity"]["shown"]
     late_s = report["fidelity"]["late_s"]
     late = [(row.t_s, row.number) for row in files.series if row.t_s >= late_s and row.number is not None]

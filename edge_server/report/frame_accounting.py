@@ -1,7 +1,7 @@
-"""Joins the ledgers of all processes into an accounting of every frame; every term is counted by itself.
+"""Joins the ledgers of all processes into an account of every frame; every term is counted separately.
 
-A frame is (camera, session, sequence). What became of it is what processes wrote. Both sums must hold for
-what was written; no term is computed as a remainder:
+A frame is (camera, session, sequence). Its outcome follows from what processes wrote. Both sums must hold for
+the written events; no term is computed as a remainder:
 
     captured = replaced + waiting + sent
     sent + duplicated = skipped + dropped_busy + superseded + lost + broken + delivered + rejected
@@ -14,19 +14,19 @@ copy counts as ``sent``, every other one as ``duplicated``. Ends of copies:
 2. **emulator**: ``skipped``, ``dropped_busy``, ``superseded``, ``lost``, ``rejected`` and ``in_flight``
    (inside the link when the emulator ended) each end one copy.
 3. Second-hand statements count only for copies that the above have not ended, because a process further down
-   the path held the frame later: an ``answered`` of the node that refuses, then ``broken``.
+   the path held the frame later: a refusal in the node's ``answered``, then ``broken``.
 4. ``cut_off``: no process wrote the end, and a process that may have held the copy was killed or still runs:
    its ledger ends without ``closed``, and a line about the frame is within ``CUT_OFF_NS`` of that end (on the
-   line's own clock). A frame that such a node captured last and did not send counts as ``waiting``.
+   line's clock). A frame that such a node captured last and did not send counts as ``waiting``.
 
-A copy with no end at all is in no term, so the second sum then fails. ``doubts`` says in words why an account
-does not close: a sum that does not come out, statements that cannot all be true (``contradictions``, such as
-a frame both dropped and delivered), ledger lines that were lost, ledgers that cannot be read.
+A copy without any end is in no term, so the second sum then fails. ``doubts`` explains why an account does not close:
+a sum that does not match, statements that cannot all be true (``contradictions``, such as a frame both dropped and
+delivered), lost ledger lines, unreadable ledgers.
 
 A frame that only the emulator or the edge wrote about (its node's ledger is on another machine) counts as
-captured and sent, with a note. Of unknown origin, and counted apart (``strangers`` in the report), is one with a
-garbled id; and where nodes' ledgers are present, one that was only ever refused, of a camera that no process accepted
-or of a session whose node did not write about it.
+captured and sent, with a note. Two kinds are of unknown origin and counted separately (``strangers`` in the report):
+frames with a garbled id; and, if nodes' ledgers are present, frames that were only ever refused, of a camera that no
+process accepted or of a session whose node did not write about it.
 
 Runs are long. Ledgers are therefore read line by line, and each frame keeps only the number of its history:
 frames share a few dozen different histories, each of which is evaluated once.
@@ -69,8 +69,8 @@ class FrameCounts(Counter[str]):
 
     @property
     def without_end(self) -> tuple[int, int]:
-        """Frames captured and copies sent that have no end by the sums of the module's docstring: both 0
-        where the sums hold, negative where more ended than there were."""
+        """Frames captured and copies sent that have no end by the sums of the module's docstring: both 0 if the sums
+        hold, negative if more ended than there were."""
         ended = sum(count for state, count in self.items() if state.partition(":")[0] in ENDS)
         unsent = self["captured"] - self["replaced"] - self["waiting"] - self["sent"]
         return unsent, self["sent"] + self["duplicated"] - ended
@@ -83,14 +83,14 @@ class FrameCounts(Counter[str]):
 
 @dataclass
 class FrameAccounting:
-    """What became of every frame of a run.
+    """The outcome of every frame of a run.
 
     total, by_camera: counts of frames and copies.
-    contradictions: the first of the statements that cannot all be true; contradiction_count: how many.
+    contradictions: the first of the statements that cannot all be true. contradiction_count: number of all.
     unknown_origin: refused frames that no camera of the run can have sent, by reason; in no other count.
     lines_lost: ledger lines that were not written or cannot be read.
     unreadable: names of ledgers that cannot be read to their end.
-    notes: lines for people on whatever was missing, torn or assumed.
+    notes: lines of text on what was missing, torn or assumed.
     ledgers: number of ledgers read.
     """
 
@@ -106,7 +106,7 @@ class FrameAccounting:
 
     @property
     def doubts(self) -> list[str]:
-        """Why not every frame is accounted for, one line each; empty where the account closes."""
+        """Why not every frame is accounted for, one line each; empty if the account closes."""
         per_camera = [counts.without_end for counts in self.by_camera.values()]
         unsent, copies = (sum(abs(found[i]) for found in per_camera) for i in (0, 1))
         found = {
@@ -138,7 +138,7 @@ class FrameAccounting:
         self.total.add(counts, times)
 
     def contradict(self, frame: str, found: Sequence[str]) -> None:
-        """Take what cannot be true about a frame."""
+        """Record contradictory statements about a frame."""
         self.contradiction_count += len(found)
         self.contradictions += [f"{frame}: {what}" for what in found[: MOST_CONTRADICTIONS - len(self.contradictions)]]
 
@@ -187,7 +187,7 @@ class _Histories:
 
 @dataclass
 class _LedgerContents:
-    """What all ledgers say.
+    """The contents of all ledgers.
 
     frames: number of each frame's history, by (camera, session) and sequence. accepted: cameras about which
     some process wrote more than refusals. unknown_events: how often each event that no role writes was read.
@@ -294,7 +294,7 @@ def _cut_off_ends(ledgers: Sequence[LedgerReader]) -> list[tuple[int, list[Event
 
 def _last_moments(ledger: LedgerReader, ends: Sequence[tuple[int, list[Event]]]) -> list[tuple[int, int, int]]:
     """(number of the role, first and last instant) of the last moments of each of ``ends``, on the clock of ``ledger``:
-    the frames about which both wrote tell how far the clocks of two machines are apart."""
+    the frames about which both wrote give the offset between the clocks of two machines."""
     wrote: dict[tuple[str, str, int], list[tuple[int, int]]] = {}
     for number, (_, tail) in enumerate(ends):
         for e in tail:
@@ -352,7 +352,7 @@ def _read_ledger(
         return
     if ledger.torn:
         notes.append(f"{name}: unreadable line left out (killed while writing, or a full disk)")
-    # A line written in part is lost to its writer and torn to its reader. What a kill cut off is not lost.
+    # A partly written line counts as lost by its writer and as torn by its reader. One cut off by a kill is not lost.
     lost = max(lost, lost_at_end, ledger.torn - (ledger.unfinished and not closed))
     accounting.lines_lost += lost
     if lost:

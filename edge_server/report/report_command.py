@@ -1,4 +1,4 @@
-"""The command ``edge-server report``: what a run left, as a page with figures."""
+"""The command ``edge-server report``: presents a run's files as a page with figures."""
 
 from __future__ import annotations
 

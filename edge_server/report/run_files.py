@@ -1,4 +1,4 @@
-"""Reads what a run left in its folder. A missing, torn or unexpected file adds a note; the report goes on."""
+"""Reads the files in a run's folder. A missing, torn or unexpected file adds a note and does not stop the report."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ProcessRow = dict[str, Number | dict[str, Number | None] | None]
 
 
 class _Started(msgspec.Struct):
-    """What a report takes from run.json, which the launcher writes."""
+    """The part of run.json, which the launcher writes, that a report uses."""
 
     command: str | None = None
 
@@ -27,12 +27,12 @@ class _Started(msgspec.Struct):
 class RunFiles:
     """Contents of a run's folder.
 
-    command: the line that started all processes, where one did.
-    restarts_s: when the edge server started again.
+    command: the command that started all processes, if one did.
+    restarts_s: when the edge server restarted.
     processes: rows {t_s, name: {rss_mb, cpu, pid}}.
     frontier: the one that the edge used.
     images: those that exist, by name.
-    notes: lines for people on whatever was missing or torn.
+    notes: lines of text on what was missing or torn.
     """
 
     out: Path
@@ -81,7 +81,7 @@ def read_run_files(out: Path) -> RunFiles:
     )
     for rows, starts in timed:
         placed = zip(rows, continuous([row.t_s for row in rows], starts))
-        kept = [(t_s, row) for row, t_s in placed if row.t_s > 0.0 or not starts]  # else it says nothing: a start
+        kept = [(t_s, row) for row, t_s in placed if row.t_s > 0.0 or not starts]  # others only mark a start
         for t_s, row in kept:
             row.t_s = t_s
         rows[:] = sorted((row for _, row in kept), key=lambda row: row.t_s)
@@ -107,13 +107,13 @@ def continuous(times_s: Sequence[float], starts_s: Sequence[float] = ()) -> list
 
 
 def restarts(times_s: Sequence[float]) -> list[float]:
-    """When the process that wrote such rows started again, on the scale of ``continuous``."""
+    """When the process that wrote these rows restarted, on the scale of ``continuous``."""
     placed = continuous(times_s)
     return [placed[k] for k in range(1, len(placed)) if times_s[k] < times_s[k - 1] - LATE_S or times_s[k] == 0.0]
 
 
 def _read(path: Path, kind: type[T], notes: list[str], optional: bool = False) -> T | None:
-    """The contents of a JSON file; None with a note where it is missing (if not optional) or something else."""
+    """The contents of a JSON file; None with a note if it is missing (unless optional) or invalid."""
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind)
     except FileNotFoundError:
@@ -125,7 +125,7 @@ def _read(path: Path, kind: type[T], notes: list[str], optional: bool = False) -
 
 
 def _read_rows(path: Path, kind: Any, notes: list[str], optional: bool = False) -> list[Any]:
-    """Rows of a JSON-lines file that are what they should be; a note counts the others."""
+    """Valid rows of a JSON-lines file; a note counts the others."""
     try:
         lines = path.read_bytes().splitlines()
     except OSError:

@@ -40,8 +40,8 @@ def ages(rows: Sequence[AgesRow]) -> dict[str, Any]:
 
 
 def depth(status: DepthStatus, rows: Sequence[AgesRow]) -> dict[str, Any]:
-    """Depth that arrived: {frames, bytes, undecodable: how many were damaged, age_ms: of the newest depth, averaged
-    over time as ``ages``, cameras: {camera: {frames, bytes}}}."""
+    """Received depth: {frames, bytes, undecodable: number of damaged ones, age_ms: of the newest depth, averaged
+    over time like ``ages``, cameras: {camera: {frames, bytes}}}."""
     counts = status.cameras.values()
     return {
         "frames": sum(camera.frames for camera in counts),
@@ -55,8 +55,8 @@ def depth(status: DepthStatus, rows: Sequence[AgesRow]) -> dict[str, Any]:
 def updates(series: Sequence[UpdateRow], edge: UpdateCounts, restarted: bool = False) -> dict[str, Any]:
     """Number and duration of updates.
 
-    series: rows of updates, used where the edge has no count; not every update has a row.
-    edge: the edge's own counts. restarted: its times are those of its last process alone, so that those of rows count.
+    series: rows of updates, used if the edge has no count; not every update has a row.
+    edge: the edge's own counts. restarted: its times cover only its last process, so those of the rows are used.
     Returns {count, ms_p50, ms_p95, first_ms: from the start of the edge to the first publication,
     undecodable, shed: frames left out for lack of time, without_step: updates without time for an optimizer
     step, refused: {camera: how often the field left its image out}}.
@@ -79,9 +79,8 @@ def updates(series: Sequence[UpdateRow], edge: UpdateCounts, restarted: bool = F
 
 
 def last_share_s(first_ms: float | None, ended_s: float) -> float:
-    """When the last fifth of a run begins, counted from its first publication to the last sample of ages: before,
-    kernels may have been compiled for longer than a short run lasts; afterwards files are written and nothing is shown
-    any more."""
+    """When the last fifth of a run begins, counted from its first publication to the last sample of ages: compiling
+    kernels before it may take longer than a short run, and afterwards files are written and nothing is shown."""
     return ended_s - FINAL_SHARE * (ended_s - (first_ms or 0.0) / 1e3)
 
 
@@ -119,7 +118,7 @@ def _since(late_s: float, rows: Sequence[Any]) -> list[Any]:
 
 
 def _means(rows: Iterable[Any], names: Sequence[str]) -> dict[str, float | None]:
-    """The mean of each attribute over the rows that know it; None where none does."""
+    """The mean of each attribute over the rows that have it; None if none has."""
     known = {name: [value for row in rows if (value := getattr(row, name)) is not None] for name in names}
     return {name: float(np.mean(values)) if values else None for name, values in known.items()}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-# what it is -> (its keys in report.json, digits)
+# label -> (keys in report.json, digits)
 _ROWS: dict[str, tuple[tuple[str, ...], int]] = {
     "shown (dB)": (("fidelity", "shown", "psnr_db"), 2),
     "shown, moving pixels (dB)": (("fidelity", "shown", "psnr_moving_db"), 2),
