@@ -1,4 +1,4 @@
-"""What the kernels of the Gaussian field work on: buffers that grow with the scene."""
+"""Working memory of the Gaussian field's kernels: buffers that grow with the scene."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class RasterBuffers:
 
     @property
     def raster(self) -> Raster:
-        """What the kernels read of the last ``project_and_bin``."""
+        """The kernels' input from the last ``project_and_bin``."""
         return Raster(self.columns, self.rows, self.projected, self.lists, self.memory, self.saved)
 
     def project_and_bin(
@@ -82,8 +82,8 @@ class RasterBuffers:
         rule: AdamParameters,
         rigid: NDArray[np.float64] | None = None,
     ) -> int:
-        """An optimizer step from the gradients in ``sums``: changes the parameters and their moments. Returns how many
-        gradients were not finite.
+        """An optimizer step from the gradients in ``sums``: changes the parameters and their moments. Returns the
+        number of gradients that were not finite.
 
         camera: as given to the last ``project_and_bin``.
         rigid: float64 (6,), written: force and torque, see ``adam_step``.

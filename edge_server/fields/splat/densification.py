@@ -16,8 +16,8 @@ from freshfield.geometry import quaternion_to_matrix
 
 @dataclass
 class GaussianCloud:
-    """The Gaussians and what is stored with each: arrays of equal length N <= ``settings.gaussians``. Their
-    names are keys of checkpoints.
+    """The Gaussians and their optimizer state: arrays of equal length N <= ``settings.gaussians``. Their names are
+    keys of checkpoints.
 
     params: (N, P), see ``kernels.project``.
     m, v, age, slope, looks, reach: see ``OptimizerState``.
@@ -33,7 +33,7 @@ class GaussianCloud:
 
     @classmethod
     def new(cls, params: NDArray[np.float32]) -> GaussianCloud:
-        """Gaussians that have made no step, with parameters float32 (N, P)."""
+        """Gaussians before their first step, with parameters float32 (N, P)."""
         n = len(params)
         slope, looks, reach = (np.zeros(n, np.float32) for _ in range(3))
         m, v, age = np.zeros_like(params), np.zeros_like(params), np.zeros(n, np.int32)
@@ -75,14 +75,14 @@ def raw_opacity(alpha: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def densify_and_prune(cloud: GaussianCloud, most: int, pixels: float, rng: np.random.Generator) -> NDArray[np.int64]:
     """Remove faint Gaussians and those that no view shows, then split those with the largest mean gradient by the
-    projected mean. Returns for each Gaussian, int64 (N,), which one of those before it comes from.
+    projected mean. Returns int64 (N,), for each Gaussian the index of the one that it comes from.
 
     The two halves together transmit as much light as the one did (Bulo et al. 2024): otherwise every split
     would darken what lies behind.
 
     most: largest number of Gaussians.
     pixels: width of the images.
-    rng: draws where the halves go.
+    rng: draws the positions of the halves.
     """
     kept = (cloud.looks > 0) & (opacity(cloud.params) >= tuned.PRUNE_OPACITY) & (cloud.params[:, OPACITY] > DEAD + 1e-3)
     cloud.keep(kept)

@@ -40,7 +40,7 @@ from edge_server.fields.splat.snapshot import SplatSnapshot
 class StillField(SteppedField[SplatSnapshot]):
     """Gaussians that do not move, and learn while they are in use. See ``SteppedField``.
 
-    Where things move, it learns what the newest view of each camera shows.
+    In a scene with motion, it learns what the newest view of each camera shows.
     """
 
     Settings = SplatSettings
@@ -52,23 +52,23 @@ class StillField(SteppedField[SplatSnapshot]):
 
     @property
     def step_time(self) -> StepTimer:
-        """How long a step takes."""
+        """Estimate of the duration of a step."""
         return self._step_time
 
     def take_in(self, views: Sequence[View]) -> None:
-        """Take ``views`` as what to learn. ValueError: one is invalid."""
+        """Make ``views`` the training views. Raises ValueError if one is invalid."""
         with self._lock:
             self._ingest(views)
 
     def keep_box(self, views: Sequence[View]) -> None:
-        """Keep the scene's box as it is, or as ``views`` have it where there is none, whatever cameras come."""
+        """Fix the scene's box, or if there is none that of ``views``, whatever cameras come later."""
         with self._lock:
             if self.view_store.box is None:
                 self.view_store.add(views)
             self.view_store.keep_box()
 
     def begin_anew(self, params: NDArray[np.float32] | None) -> None:
-        """Forget views and Gaussians, but for the scene's box.
+        """Forget views and Gaussians, but not the scene's box.
 
         params: float32 (N, P), of the first Gaussians; None: they are found from the next views.
         """
@@ -87,7 +87,7 @@ class StillField(SteppedField[SplatSnapshot]):
         return loss, pixels, pairs
 
     def error(self) -> float:
-        """Mean squared error of the views that were taken in, as ``train_step`` has it."""
+        """Mean squared error of the training views, as in ``train_step``."""
         with self._lock:
             square, pixels = 0.0, 0
             for view in self._asked:
@@ -151,7 +151,7 @@ class StillField(SteppedField[SplatSnapshot]):
         return np.random.default_rng(np.random.SeedSequence([self.settings.seed, self.step, purpose]))
 
     def _ingest(self, views: Sequence[View]) -> None:
-        """Take new views in; seed the Gaussians if there are none."""
+        """Add new views; seed the Gaussians if there are none."""
         if not same_views(views, self._views):
             intake = self.view_store.add(views)
             if intake.box_changed:
@@ -165,11 +165,11 @@ class StillField(SteppedField[SplatSnapshot]):
         self._snapshot = None
 
     def _pose_of(self, view: View) -> NDArray[np.float64]:
-        """Where a view is learned from: camera to world (4, 4)."""
+        """The pose that a view is trained at: camera to world (4, 4)."""
         return view.camera_to_world
 
     def _next_view(self) -> int:
-        """The view of this step: all take turns, in an order that is drawn anew for each pass."""
+        """The view of this step: all take turns, in a new random order for each pass."""
         count = len(self._asked)
         if self._epoch != self.step // count:
             self._epoch = self.step // count
@@ -180,8 +180,8 @@ class StillField(SteppedField[SplatSnapshot]):
     def _one_step(self, progress: float, grow: bool = True) -> tuple[float, int, int, int]:
         """One optimizer step at ``progress`` of the fit, in [0, 1]. grow: see ``train_step``.
 
-        Returns the mean squared error, pixels, pairs of a Gaussian and a tile, and how many tiles and
-        gradients were not finite.
+        Returns the mean squared error, pixels, pairs of a Gaussian and a tile, and the number of tiles and
+        gradients that were not finite.
         """
         view = self._next_view()
         camera, cloud, raster = self._camera(view), self.cloud, self._raster
@@ -206,13 +206,13 @@ class StillField(SteppedField[SplatSnapshot]):
         return square / (3 * pixels), pixels, pairs, int(broken) + dropped
 
     def _camera(self, view: int) -> NDArray[np.float32]:
-        """The row (1, CAMERA) of a view's camera, from where it is learned now."""
+        """The row (1, CAMERA) of a view's camera at the pose that it is trained at now."""
         one, box = self._views[view], self.view_store.box
         assert box is not None
         return camera_rows([self._pose_of(one)], [one.intrinsics], box)
 
     def _target(self, view: int) -> Target:
-        """A view as what to learn."""
+        """A view as a training target."""
         return Target(*self._pixels_of(view), self.view_store.background())
 
     def _pixels_of(self, view: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
@@ -234,7 +234,7 @@ class StillField(SteppedField[SplatSnapshot]):
         )
 
     def _learn_camera(self, view: int, losses: NDArray[np.float64]) -> None:
-        """Learn what a step says of the camera of a view. losses: see ``train_tiles``."""
+        """Update the camera of a view from a step. losses: see ``train_tiles``."""
 
     def _grow_if_due(self) -> None:
         # Not before every view has had a step.
@@ -249,8 +249,8 @@ class StillField(SteppedField[SplatSnapshot]):
             self._seed()
 
     def _protect_unsupervised(self) -> None:
-        """Count as seen what is visible in tiles with pixels of weight 0, or in the last view of a camera
-        without a current view: that a Gaussian has no gradient there does not mean that it is not needed."""
+        """Count Gaussians as seen if they are visible in tiles with pixels of weight 0, or in the last view of a camera
+        without a current view: they may be needed although they have no gradient there."""
         cloud, box = self.cloud, self.view_store.box
         assert box is not None
         data = self._data
@@ -268,7 +268,7 @@ class StillField(SteppedField[SplatSnapshot]):
         cloud.looks[shows] = np.maximum(cloud.looks[shows], 1.0)
 
     def _weight_of(self, view: int) -> NDArray[np.float32]:
-        """How much each pixel of a view counts, (H, W); (0, 0) where all count in full."""
+        """Weight of each pixel of a view, (H, W); (0, 0) if all have full weight."""
         (w, h), first, weight = self._data.size[view], self._data.first[view], self._data.weight
         return weight[first : first + w * h].reshape(h, w) if weight.size else weight.reshape(0, 0)
 
@@ -282,7 +282,7 @@ class StillField(SteppedField[SplatSnapshot]):
         )
 
     def _repair(self) -> None:
-        """Replace what is not finite; such Gaussians become invisible and are pruned."""
+        """Replace values that are not finite; such Gaussians become invisible and are pruned."""
         clamp_gaussians(self.cloud.params)
         for array in (self.cloud.m, self.cloud.v):
             np.nan_to_num(array, copy=False, nan=0.0, posinf=0.0, neginf=0.0)

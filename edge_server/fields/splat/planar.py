@@ -47,7 +47,7 @@ def unit_quaternions(params: NDArray[np.float32]) -> NDArray[np.float64]:
 def blend_planes(
     raster: RasterBuffers, params: NDArray[np.float32], camera: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """The Gaussians' planes, blended as their colors are: normal (H, W, 3), distance (H, W) and opacity (H, W).
+    """The Gaussians' planes, blended like their colors: normal (H, W, 3), distance (H, W) and opacity (H, W).
 
     raster: buffers whose last ``project_and_bin`` had this camera. camera: float32 (CAMERA,), its row.
     """

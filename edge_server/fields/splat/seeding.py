@@ -65,7 +65,7 @@ def seed_gaussians(
     if found.size == 0:
         return params
     focal = data.lens[:, 0]
-    # Several views see each place: the spacing in space is that of the rays of all of them.
+    # Several views see each place: the spacing is that of the rays of all views together.
     see = min(max(len(views) / SEED_VIEWS, 1.0), SEED_MOST_SEE)
     spacing = np.sqrt(where.size / found.size / see)
     view_of, local, distance = view_of[found], local[found], distance[found]
@@ -86,7 +86,7 @@ def seed_gaussians(
 def _candidate_pixels(
     settings: SplatSettings, views: Sequence[View], data: Views, masks: Sequence[NDArray[np.bool_] | None] | None
 ) -> NDArray[np.int64]:
-    """Indices, over all views, of the pixels that do not show plain background."""
+    """Indices, over all views, of the pixels that do not show uniform background."""
     plain = empty_color(settings, [views[k] for k in supervising_views(data)])
     parts = [np.zeros(0, np.int64)]
     for k, view in enumerate(views):

@@ -1,1 +1,1 @@
-"""Gaussians of a scan: many views, usually of one moving camera, of a scene that stands still."""
+"""Gaussians of a scan: many views, usually from one moving camera, of a static scene."""

@@ -1,8 +1,8 @@
-"""The Gaussian field of cameras that are carried about, live: a scan whose views come one after the other.
+"""The Gaussian field of hand-held cameras, live: a scan with sequential views.
 
-``fit`` takes the newest view of each camera. Now and then one becomes a keyframe: it continues from the correction and
-the exposure of its predecessor, and seeds Gaussians where the field lacks what its depth measures. Steps are shared
-between the newest keyframes and all of them.
+``fit`` takes the newest view of each camera. Some become keyframes: a keyframe starts with the correction and the
+exposure of its predecessor, and seeds Gaussians where the field lacks surfaces that its depth measures. Steps are
+shared between the newest keyframes and all of them.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from edge_server.fields.splat.carried_camera.scan_field import ScanField, Shown,
 from edge_server.fields.splat.carried_camera.seeds_on_depth import usable_depth
 from edge_server.fields.splat.densification import opacity
 
-# What a field that begins anew, which no depth was measured for, still knows of its cameras and their frames.
+# State of cameras and frames that a restarted field without measured depth keeps.
 _OF_CAMERAS = ("_pixels", "_taken", "_blind", "_bare", "_seen", "_seen_m")
 _COUNTS = ("_taken", "_blind", "_bare", "_took_at", "_due_before", "_pixels", "_measured")  # that a state keeps
 
@@ -35,7 +35,7 @@ _NO_DEPTH = "its frames tell no depth (it only turns, or sees plain walls): dist
 
 
 class CarriedField(ScanField):
-    """See ``ScanField``. It asks for every frame: depth may come with each fifth only."""
+    """See ``ScanField``. It asks for every frame, because only one in five may have depth."""
 
     frame_s = 0.0
     full_steps = np.inf
@@ -44,15 +44,15 @@ class CarriedField(ScanField):
         super()._forget_parameters()
         self._clear_views()
         self._pixels, self._taken = 0, 0  # of the largest image, and keyframes, so far
-        self._blind = 0  # keyframes before the first ones that told a depth
+        self._blind = 0  # keyframes before the first ones that gave depth
         self._bare = True  # whether no keyframe so far shows anything
         self._took_at = 0  # step of the newest keyframe
-        self._due_before = 0  # keyframes that were due before the field began anew, which counts steps from 0 again
+        self._due_before = 0  # keyframes that were due before the restart, which resets the step count
         self._own = OwnMotion(self._poses)
         self._moving: dict[str, float] = {}  # share of a camera's newest keyframe where something moves
         self._depths: dict[str, View] = {}  # the newest keyframe of each camera that had depth
         self._measured = False  # whether any keyframe had depth
-        self._seen: dict[str, View] = {}  # the last view of each camera that became a keyframe, as it was given
+        self._seen: dict[str, View] = {}  # the last view of each camera that became a keyframe, as given
 
     def _ingest(self, views: Sequence[View]) -> None:
         for view in views:
@@ -73,7 +73,7 @@ class CarriedField(ScanField):
         )
 
     def _begin(self, views: Sequence[View]) -> None:
-        """Find the scene's box: where depth is measured, its median is the distance of the scene."""
+        """Find the scene's box: if depth is measured, its median is the distance of the scene."""
         self._data = self.view_store.add(views).data  # the first Gaussians may need its weights: none
         self.view_store.keep_box()
         box, depths = self.view_store.box, [usable_depth(view.depth) for view in views]
@@ -144,12 +144,12 @@ class CarriedField(ScanField):
 
     @property
     def _founded(self) -> bool:
-        """Whether any depth was measured or told by frames. A camera that only turns tells none, nor does a bare wall,
-        which fits at any depth: what the field shows then is a guess, with which no frame has to agree."""
+        """Whether any depth was measured or found by stereo. A camera that only turns gives none, nor does a bare wall,
+        which matches at any depth: the field is then a guess, with which frames need not agree."""
         return self._measured or (self._seen_m > 0.0 and not self._bare)
 
     def _sweep(self, view: View) -> NDArray[np.float32] | None:
-        """Depth of a view from the keyframes beside it, at the poses that are believed."""
+        """Depth of a view from neighboring keyframes, at the estimated poses."""
         posed = [replace(other, camera_to_world=self._pose_of(other)) for other in (view, *self._views)]
         return usable_depth(sweep_depth(posed[0], posed[1:], self._seen_m or self._distance_m(), self.pool))
 
@@ -158,7 +158,7 @@ class CarriedField(ScanField):
         return self.view_store.box.distance_m
 
     def _follow(self, view: View) -> None:
-        """Begin with the correction and the exposure of the keyframe before."""
+        """Start with the correction and the exposure of the previous keyframe."""
         if self._rigid is None:
             return
         track = _carrier(view)
@@ -168,7 +168,7 @@ class CarriedField(ScanField):
             self._exposures.known[view.camera] = self._exposures.between(before)
 
     def _track(self, view: View, prior: float | None = None) -> Alignment:
-        """Correct the pose of a view by what it shows. prior: see ``align``."""
+        """Correct the pose of a view by image alignment. prior: see ``align``."""
         frame = gray(view.image)
         for _ in range(tuned.ALIGNMENTS):
             found = align(self._rendered(view, self._pose_of(view)), frame, view.camera_to_world, prior=prior)
@@ -176,7 +176,7 @@ class CarriedField(ScanField):
         return found
 
     def _leaps_out_of_sight(self, view: View, shown: Shown) -> bool:
-        """Whether a view is reported far from the one before, where hardly anything is shown."""
+        """Whether the reported pose of a view is far from the one before, where the field shows hardly anything."""
         seen = (shown.opacity >= tuned.ALIGNED_OPACITY).mean()
         leaps = self._own.leaps(view, view.camera) and seen < tuned.LEAST_OVERLAP and self._founded
         if leaps and self._measured:
@@ -184,8 +184,8 @@ class CarriedField(ScanField):
         return leaps
 
     def _placed(self, view: View, shown: Shown, unseen: bool) -> View | None:
-        """A view where its picture was taken: near its reported pose, else near the view before. None: it shows
-        something else than is to be seen from there. unseen: see ``_leaps_out_of_sight``."""
+        """A view at its estimated pose: near the reported one, else near the view before. None: its image is not
+        consistent with the field there. unseen: see ``_leaps_out_of_sight``."""
         camera = _carrier(view)
         reports = self._own.of(camera)
         if reports.astray:
@@ -228,8 +228,8 @@ class CarriedField(ScanField):
         return view if self._plausible(view, tracked, leapt) else None
 
     def _fits_after_leap(self, view: View) -> bool:
-        """Whether a view fits where a leap leads: to the field, or to the keyframe before, since a camera that went on
-        sees what no keyframe has shown the field yet."""
+        """Whether a view fits at the pose after a leap: to the field, or to the previous keyframe, since a camera that
+        moved on sees places that the field does not contain yet."""
         there = self._track(view, tuned.GUESSED_ERROR)
         if there.fits:
             return True
@@ -264,7 +264,7 @@ class CarriedField(ScanField):
         return Rendered(pose, lens, gray(shown.color), shown.depth, shown.opacity)
 
     def _plausible(self, view: View, found: Alignment, leapt: bool) -> bool:
-        """Whether a view shows what the field does, or so many in a row did not that this one is taken."""
+        """Whether a view is consistent with the field, or is accepted because too many in a row were not."""
         reports = self._own.of(_carrier(view))
         fits = found.overlap < tuned.LEAST_OVERLAP or found.agreeing >= tuned.LEAST_AGREEING
         taken = (fits and not leapt) or reports.left_out_in_a_row >= tuned.PATIENCE
@@ -278,7 +278,7 @@ class CarriedField(ScanField):
         self._exposures.known.pop(view.camera, None)
 
     def _without_what_moves(self, view: View) -> View:
-        """The view, with a weight of 0 where something has come since the last keyframe with depth."""
+        """The view, with weight 0 where an object has appeared since the last keyframe with depth."""
         camera = _carrier(view)
         before, self._moving[camera] = self._depths.get(camera), 0.0
         if view.depth is None:
@@ -295,7 +295,7 @@ class CarriedField(ScanField):
 
     @property
     def troubles(self) -> tuple[str, ...]:
-        """What is wrong with the cameras' frames and poses, for people."""
+        """Problems of the cameras' frames and poses, in words."""
         with self._lock:
             left_out = [
                 f"{camera}: {known.left_out} frames left out: they show something else than their poses say"
@@ -315,9 +315,9 @@ class CarriedField(ScanField):
         return (*left_out, *located, *moving, *poses, *unknown)
 
     def _begin_anew(self) -> None:
-        """Find the first Gaussians from all keyframes so far: without depth, the first few say little, and a field that
-        was fitted to them is not mended by later ones. The depth that is found also serves the box and the poses: steps
-        that take the scene for farther than it is overshoot. Where none is found, the box stays."""
+        """Restart with Gaussians seeded from all keyframes so far: without depth, the first few hold little information
+        and later ones do not repair a field fitted to them. The depth found also updates the box and the poses: steps
+        that overestimate the scene's distance overshoot. If none is found, the box stays."""
         swept = {view.camera: view for view in self._sweep_views()}
         self._learn_distance(list(swept.values()))
         views, kept = [swept.get(v.camera, v) for v in self._views], {name: getattr(self, name) for name in _OF_CAMERAS}
@@ -334,11 +334,11 @@ class CarriedField(ScanField):
         if swept:
             self._seed_on([view for view in views if view.camera in swept], nearer=False)
         else:
-            self._seen_m = 0.0  # what an earlier start found says nothing of this one's guesses
+            self._seen_m = 0.0  # the distance found by an earlier start does not apply to this one's guesses
             self._seed()
 
     def _append(self, view: View, aim: tuple[NDArray[np.float64], float]) -> None:
-        """Learn from a view from now on. Its depth has served."""
+        """Add a view to the training views. Its depth is no longer needed."""
         view = replace(view, depth=None)
         self._views = (*self._views, view)
         moved = None if view.weight is None else view.weight == 0.0
@@ -346,13 +346,13 @@ class CarriedField(ScanField):
         self._aims.append(aim)
 
     def _aim(self, view: View, shown: Shown | None) -> tuple[NDArray[np.float64], float]:
-        """What ``PoseCorrections.descend`` needs of a view."""
+        """The input of ``PoseCorrections.descend`` for a view."""
         if view.depth is None and shown is not None:
             view = replace(view, depth=np.where(shown.opacity >= tuned.COVERED, shown.depth, np.float32(0.0)))
         return aim_of(view, self._distance_m())
 
     def _expose(self, view: View, shown: Shown) -> None:
-        """Find the exposure of a view at its first rendering, from pixels that look as expected."""
+        """Find the exposure of a view at its first rendering, from consistent pixels."""
         gain, bias = self._exposures.of(view.camera)
         image = view.image[::2, ::2, :3].reshape(-1, 3) / 255.0
         rendered = shown.color[::2, ::2].reshape(-1, 3).astype(np.float64)
@@ -365,7 +365,7 @@ class CarriedField(ScanField):
         self._exposures.learn(view.camera, sums, whole=True)
 
     def _drop(self, k: int) -> None:
-        """Learn from a keyframe no longer. Its correction stays, for held-out and late frames of its time."""
+        """Remove a keyframe from training. Its correction stays, for held-out and late frames of its time."""
         gone = self._views[k]
         self._views = (*self._views[:k], *self._views[k + 1 :])
         del self.view_store.memory[gone.camera], self._aims[k]
@@ -392,7 +392,7 @@ class CarriedField(ScanField):
             super()._grow()
 
     def _make_room(self, count: int) -> None:
-        """Remove the Gaussians that show least, faint and small ones, until ``count`` more may be added."""
+        """Remove the least visible Gaussians (faint and small), until ``count`` more may be added."""
         surplus = len(self.cloud) + min(count, self._most()) - self._most()
         if surplus > 0:
             shows = opacity(self.cloud.params) * np.maximum(self.cloud.reach, np.float32(1e-9))
@@ -436,13 +436,13 @@ class CarriedField(ScanField):
 
 
 def _carrier(view: View) -> str:
-    """The camera that a keyframe is of."""
+    """The camera that took a keyframe."""
     return view.camera.rpartition(SEPARATOR)[0]
 
 
 def _is_bare(view: View) -> bool:
-    """Whether a view shows nothing: a bare wall, a hand or a cap on the lens. Learned from alone, it says neither
-    where nor how large the scene is."""
+    """Whether a view shows nothing: a bare wall, a hand or a cap on the lens. Alone, it determines neither place nor
+    size of the scene."""
     return bool(gray(view.image).std() < tuned.BARE)
 
 

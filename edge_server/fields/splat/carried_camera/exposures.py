@@ -1,4 +1,4 @@
-"""The exposure of each view of a scan: a gain and a bias a channel, by which what is rendered becomes the image."""
+"""The exposure of each view of a scan: a gain and a bias per channel, which map the rendering to the image."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _NEUTRAL = np.array([[1.0] * 3, [0.0] * 3])
 class Exposures:
     """Exposures by view, found in closed form: image = gain * rendering + bias.
 
-    Only their ratios mean something, since colors may take over what they have in common: the geometric mean of the
+    Only their ratios are determined, since a common factor can be absorbed by the colors: the geometric mean of the
     gains is kept at 1, the mean of the biases at 0.
     """
 
@@ -30,7 +30,7 @@ class Exposures:
         return self.known.get(camera, _NEUTRAL)
 
     def between(self, neighbors: dict[str, float]) -> Array:
-        """Gains and biases (2, 3) between those of others. neighbors: the others and their weights."""
+        """Gains and biases (2, 3) interpolated from other views. neighbors: these views and their weights."""
         if not neighbors:
             return _NEUTRAL
         parts = [(share, *self.of(name)) for name, share in neighbors.items()]
@@ -45,8 +45,8 @@ class Exposures:
         return row
 
     def learn(self, camera: str, sums: Array, whole: bool = False) -> None:
-        """Move a view's exposure towards the damped least squares of a step, all the way the first time. Nothing where
-        sums are not finite, or of no pixels.
+        """Move a view's exposure toward the damped least-squares solution of a step, all the way the first time. Does
+        nothing if sums are not finite or contain no pixels.
 
         sums: (3, MOMENTS), see ``rasterize.MOMENTS``, at the exposure as known.
         whole: go all the way.
@@ -73,7 +73,7 @@ class Exposures:
             self.known[name] = _bounded(np.stack([gain / mean[0], bias - mean[1]]))
 
     def meta(self) -> dict[str, Any]:
-        """What a state keeps: exact, ready for JSON."""
+        """The exact state, as JSON values."""
         return {name: known.tolist() for name, known in self.known.items()}
 
     def load(self, meta: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""Depth of a carried camera's frame from frames taken beside it, where no sensor measures it: see ``stereo``.
+"""Depth of a hand-held camera's frame from neighboring frames, if no sensor measures it: see ``stereo``.
 
 Images are compared by their local contrast, so that their exposures do not matter.
 """
@@ -23,10 +23,10 @@ Array = NDArray[np.float64]
 
 
 def neighbors(pose: Array, others: Sequence[Array], distance_m: float) -> list[int]:
-    """Which of the other cameras see, from elsewhere, what the one at ``pose`` sees: at most ``SWEPT_WITH``, the best
+    """Indices of the other cameras with a baseline to ``pose`` that see the same surfaces: at most ``SWEPT_WITH``, best
     first.
 
-    pose, others: camera to world (4, 4). distance_m: from the camera to what it sees.
+    pose, others: camera to world (4, 4). distance_m: from the camera to the surfaces that it sees.
     """
     if not others:
         return []
@@ -48,8 +48,8 @@ def sweep_depth(view: View, others: Sequence[View], distance_m: float, pool: Poo
     """Depth of a view, float32 (H, W), meters along the optical axis, 0 where it is unknown; None if no other view
     shows the same from elsewhere.
 
-    view, others: at the poses that are believed, refined where they are. distance_m: see ``neighbors``; what is nearer
-        than ``SWEPT_NEAR`` of it is not found.
+    view, others: at their estimated poses. distance_m: see ``neighbors``; surfaces nearer than ``SWEPT_NEAR`` of it
+        are not found.
     """
     near = neighbors(view.camera_to_world, [other.camera_to_world for other in others], distance_m)
     if not near:

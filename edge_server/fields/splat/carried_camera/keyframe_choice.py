@@ -1,4 +1,4 @@
-"""Which views of a carried camera become keyframes, which ones stay, and which one a step learns from."""
+"""Selects the views of a hand-held camera that become keyframes, those that are kept, and the view of each step."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from edge_server.fields.splat.carried_camera import carried_camera_constants as 
 
 
 def due(steps: int, cameras: int, taken: int) -> int:
-    """How many more keyframes may be taken: the first of each of ``cameras``, then one in so many steps, less those
-    that were ``taken``."""
+    """Number of keyframes that are due: the first of each of ``cameras``, then one per STEPS_A_KEYFRAME steps, minus
+    those already ``taken``."""
     return steps // tuned.STEPS_A_KEYFRAME + cameras - taken
 
 
 def next_keyframes(views: Sequence[View], seen: Mapping[str, View], most: int) -> list[View]:
-    """The views that become keyframes: of each camera the newest, of those with depth if there are any, as only they
-    seed. All of cameras that have none yet, and of the others at most ``most``, longest without one first.
+    """The views that become keyframes: each camera's newest, among those with depth if any, as only these seed. All
+    for cameras without a keyframe, and at most ``most`` of the others, longest without one first.
 
     seen: the last view of each camera that became a keyframe.
     """
@@ -33,14 +33,14 @@ def next_keyframes(views: Sequence[View], seen: Mapping[str, View], most: int) -
 
 
 def most_kept(pixels: int) -> int:
-    """The most keyframes of ``pixels`` each."""
+    """Largest number of keyframes with ``pixels`` each."""
     return min(max(tuned.KEPT_PIXELS // pixels, tuned.LEAST_KEPT), tuned.MOST_KEPT)
 
 
 def least_needed(poses: Sequence[NDArray[np.float64]], distance_m: float) -> int:
-    """The older of the two keyframes that were taken nearest to each other, the newest ones apart.
+    """Index of the older of the two keyframes nearest to each other, excluding the newest ones.
 
-    poses: (4, 4) of each keyframe, oldest first. distance_m: of the scene; so much of a shift counts as a turn of one
+    poses: (4, 4) of each keyframe, oldest first. distance_m: of the scene; a shift by it counts as a turn of one
     radian.
     """
     place, old = np.stack(poses), len(poses[: -tuned.NEWEST])
@@ -54,7 +54,7 @@ def least_needed(poses: Sequence[NDArray[np.float64]], distance_m: float) -> int
 def next_view(rng: np.random.Generator, count: int, cameras: int, steps_since: int) -> int:
     """The newest of ``count`` keyframes while it is fresh, else one of the newest, or any of them.
 
-    cameras: how many there are. steps_since: the newest keyframe.
+    cameras: their number. steps_since: steps since the newest keyframe.
     """
     if steps_since < tuned.FRESH_STEPS:
         return count - 1

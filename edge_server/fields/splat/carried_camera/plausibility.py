@@ -1,4 +1,4 @@
-"""What cannot be right of a carried camera's frames: things that move, and poses that are late."""
+"""Plausibility of a hand-held camera's frames: detects moving objects, covered lenses and late or drifting poses."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 
 def moved_in(now: View, pose: Array, before: View, before_pose: Array) -> NDArray[np.bool_]:
-    """Pixels, bool (H, W), of surfaces where an earlier frame saw through: they have come since. What stands still is
-    never there, however new it is to the camera. Both views have depth; poses: camera to world (4, 4)."""
+    """Pixels, bool (H, W), of surfaces in space that an earlier frame saw as free: they have appeared since. This holds
+    for no static surface, even one new to the camera. Both views have depth; poses: camera to world (4, 4)."""
     assert now.depth is not None and before.depth is not None
     every, lens, other = tuned.MOVED_EVERY, now.intrinsics, before.intrinsics
     z = now.depth[::every, ::every].astype(np.float64)
@@ -32,7 +32,7 @@ def moved_in(now: View, pose: Array, before: View, before_pose: Array) -> NDArra
     ahead = local[:, 2].reshape(z.shape)
     there = (z > 0) & (ahead > 1e-3) & inside.reshape(z.shape)
     u, v = np.where(inside[:, None], at, 0.0).astype(np.int64).T.reshape(2, *z.shape)
-    # The nearest surface around: edges, and errors of poses, are no free space.
+    # The nearest surface in the neighborhood: edges and pose errors do not count as free space.
     known = np.where(before.depth > 0, before.depth, np.float32(0.0))
     nearest = cv2.erode(known, np.ones((2 * every + 1, 2 * every + 1), np.uint8))
     through = there & (nearest[v, u] > ahead * (1.0 + tuned.MOVED_SHARE) + tuned.MOVED_M)
@@ -43,7 +43,7 @@ def moved_in(now: View, pose: Array, before: View, before_pose: Array) -> NDArra
 
 
 def agreeing(view: View, shown: Shown, gain: Array, bias: Array) -> float:
-    """The share of a view's pixels, of those where the field shows a surface, that look as expected."""
+    """The share of consistent pixels of a view, among those where the field shows a surface."""
     expected = shown.color * gain.astype(np.float32) + bias.astype(np.float32)
     surface = shown.opacity[::2, ::2] >= tuned.ALIGNED_OPACITY
     error = np.abs(gray(expected[::2, ::2]) - gray(view.image[::2, ::2]))[surface]
@@ -51,8 +51,8 @@ def agreeing(view: View, shown: Shown, gain: Array, bias: Array) -> float:
 
 
 def flat(view: View, shown: Shown) -> bool:
-    """Whether a view shows hardly anything where the field shows something: its lens is covered, or it is dark. An
-    exposure could be found by which it agrees."""
+    """Whether a view has hardly any contrast where the field has some: its lens is covered, or it is dark. Otherwise an
+    exposure could be found that makes it consistent."""
     surface = shown.opacity >= tuned.ALIGNED_OPACITY
     if surface.mean() < tuned.LEAST_OVERLAP:
         return False
@@ -61,8 +61,8 @@ def flat(view: View, shown: Shown) -> bool:
 
 
 def unturned(before: View, now: View) -> bool:
-    """Whether two views of a camera are reported with the same rotation, and their pictures contradict that: most
-    corners do not move as the reported shift moves them, whatever their depth."""
+    """Whether two views of a camera are reported with the same rotation, and their images contradict that: most
+    corners do not move as the reported translation would move them at any depth."""
     turned = np.abs(now.camera_to_world[:3, :3] - before.camera_to_world[:3, :3]).max()
     if turned > tuned.SAME_TURN or before.image.shape != now.image.shape:
         return False
@@ -77,7 +77,7 @@ def unturned(before: View, now: View) -> bool:
         return False
     rays, others = before.intrinsics.rays(here), now.intrinsics.rays(there)
     at, flow = rays[:, :2] / rays[:, 2:], others[:, :2] / others[:, 2:] - rays[:, :2] / rays[:, 2:]
-    way = at * shift[2] - shift[:2]  # away from where the camera moves to, the farther the nearer a corner is
+    way = at * shift[2] - shift[:2]  # away from the focus of expansion, farther the nearer a corner is
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-12)
     beside = flow - np.maximum((flow * way).sum(axis=1, keepdims=True), 0.0) * way
     moved_px, beside_px = (now.intrinsics.fx * np.median(np.linalg.norm(each, axis=1)) for each in (flow, beside))
@@ -85,7 +85,7 @@ def unturned(before: View, now: View) -> bool:
 
 
 def troubles(poses: PoseCorrections) -> list[str]:
-    """What corrections of poses say that is wrong with them, a line each."""
+    """Problems of poses that follow from their corrections, a line each."""
     found = []
     for track in poses.tracks():
         newest = poses.newest(track, tuned.JUDGED)
@@ -94,7 +94,7 @@ def troubles(poses: PoseCorrections) -> list[str]:
         late_s = _lateness_s(newest)
         if late_s is not None:
             word = "late" if late_s > 0 else "early"
-            least = f"by some {1e3 * abs(late_s):.0f} ms or more"  # corrections follow a part of a delay
+            least = f"by some {1e3 * abs(late_s):.0f} ms or more"  # corrections cover only a part of a delay
             found.append(f"{track}: its poses are {word} {least}: camera-node doctor measures it in a recording")
         shift_m = float(np.median([np.linalg.norm(c.shift_m) for c in newest]))
         turn_rad = float(np.median([np.linalg.norm(c.rotation) for c in newest]))
@@ -125,7 +125,7 @@ def _lateness_s(views: Sequence) -> float | None:
     if len(moves) < tuned.JUDGED // 2:
         return None
     v, c = np.stack(moves), np.stack(corrections)
-    v, c = v - v.mean(axis=0), c - c.mean(axis=0)  # what is constant is a calibration's
+    v, c = v - v.mean(axis=0), c - c.mean(axis=0)  # a constant part is a calibration error
     if not (v * v).sum() > 0.0:
         return None
     late_s = float((v * c).sum() / (v * v).sum())

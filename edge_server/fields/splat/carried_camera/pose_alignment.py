@@ -1,8 +1,8 @@
 """The pose of a new frame by direct image alignment with the field (Gauss-Newton, coarse to fine).
 
-One rendering with depth serves several iterations: its pixels are moved by the motion that is sought, which costs a
-warp of the frame and no rendering (Lucas and Kanade 1981; slopes are the means of both images', as in the efficient
-second-order minimization of Benhimane and Malis 2004).
+One rendering with depth serves several iterations: its pixels are warped by the current motion estimate, which needs
+no further rendering (Lucas and Kanade 1981; gradients are the means of both images', as in the efficient second-order
+minimization of Benhimane and Malis 2004).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Gray = NDArray[np.float32]
 
 
 class Rendered(NamedTuple):
-    """What the field shows from a pose.
+    """The field rendered from a pose.
 
     pose: camera to world (4, 4). lens: of the rendering. gray, depth, opacity: (H, W); depth along the optical axis,
     meters.
@@ -37,7 +37,7 @@ class Rendered(NamedTuple):
 
 class Alignment(NamedTuple):
     """pose: camera to world (4, 4), of the frame. overlap: share of the rendering's pixels that show a surface within
-    the frame. agreeing: share of these that look as expected."""
+    the frame. agreeing: share of these that are consistent."""
 
     pose: Array
     overlap: float
@@ -45,7 +45,7 @@ class Alignment(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether enough is seen, and looks as expected, for the pose to be believed whatever is reported."""
+        """Whether overlap and consistency suffice to accept the pose whatever is reported."""
         return self.overlap >= tuned.LEAST_OVERLAP and self.agreeing >= tuned.LOCATED
 
 
@@ -66,10 +66,9 @@ def align(
 ) -> Alignment:
     """Find the pose of a frame near that of a rendering.
 
-    frame: (H, W) in [0, 1], of the rendering's size or larger. given: its pose as reported, (4, 4), from which it
-    moves away reluctantly. begin: the pose to begin with, (4, 4); None: the rendering's. levels: see ``LEVELS``.
-    prior: None: ``PRIOR_ERROR``. A size of too few pixels is left out; where equations cannot be solved, the pose to
-    begin with stays.
+    frame: (H, W) in [0, 1], of the rendering's size or larger. given: its reported pose, (4, 4), the mean of the prior.
+    begin: initial pose, (4, 4); None: the rendering's. levels: see ``LEVELS``. prior: None: ``PRIOR_ERROR``. Levels
+    with too few pixels are skipped; if equations cannot be solved, the initial pose is kept.
     """
     motion = np.eye(4) if begin is None else se3_inverse(begin) @ shown.pose
     prior, light = tuned.PRIOR_ERROR if prior is None else prior, np.array([1.0, 0.0])
@@ -96,8 +95,8 @@ def align(
 
 
 def align_from(shown: Rendered, frame: Gray, candidates: Sequence[Array], last: float = 0.0) -> Alignment:
-    """Find the pose of a frame from several guesses, (4, 4) each: the one that fits best at the coarse sizes is
-    followed to the finest. last: the last one is taken if it fits worse than the best by less than this share."""
+    """Find the pose of a frame from several guesses, (4, 4) each: the best one at the coarse levels is refined to the
+    finest. last: the last guess is taken if it fits worse than the best by less than this share."""
     coarse, finest = tuned.LEVELS[:-1], tuned.LEVELS[-1:]
     found = [align(shown, frame, pose, pose, coarse, tuned.GUESSED_ERROR) for pose in candidates]
     fit = [min(each.overlap, tuned.ENOUGH_OVERLAP) * each.agreeing for each in found]
@@ -116,7 +115,7 @@ class _Level:
         self.slopes = tuple(cv2.Sobel(self.frame, cv2.CV_32F, x, y, scale=0.125) for x, y in ((1, 0), (0, 1)))
         own = tuple(cv2.Sobel(reference, cv2.CV_32F, x, y, scale=0.125) for x, y in ((1, 0), (0, 1)))
         depth, opacity = (part[::every, ::every] for part in (shown.depth, shown.opacity))
-        # Of the largest level every second pixel: neighbors say much the same.
+        # Every second pixel of the largest level: neighbors are redundant.
         few = max(1, round(np.sqrt(depth.size / tuned.MOST_ALIGNED)))
         chosen = np.zeros(depth.shape, np.bool_)
         chosen[::few, ::few] = True

@@ -1,4 +1,4 @@
-"""What a scan has learned of its cameras, and how to render what a camera saw that it does not learn from."""
+"""A scan's estimates of its cameras, and how to render the views of cameras that it does not train on."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edge_server.fields.splat.snapshot import SplatSnapshot
 
 @dataclass(frozen=True)
 class RefinedCameras:
-    """Corrections of poses, and exposures, of the views that are learned from."""
+    """Pose corrections and exposures of the training views."""
 
     poses: PoseCorrections
     exposures: Exposures
@@ -27,7 +27,7 @@ class RefinedCameras:
         return RefinedCameras(self.poses.copied(), exposures)
 
     def correction(self, view: View) -> Correction:
-        """How to render what ``view`` saw: as it was learned, else as its neighbors in time suggest."""
+        """How to render ``view``: as learned, else interpolated from its neighbors in time."""
         learned = self.poses.learned_pose(view)
         if learned is not None:
             return Correction(learned, *self.exposures.of(view.camera))
@@ -37,8 +37,8 @@ class RefinedCameras:
         return Correction(self.poses.pose_between(view, neighbors), *self.exposures.between(neighbors))
 
     def _track_of(self, view: View) -> str:
-        """The track of the view's own camera, else the one whose views of that time were taken nearest to it: what is
-        held out may be frames of a camera that is carried."""
+        """The track of the view's camera, else the one whose views of that time are nearest to it: held-out frames may
+        come from a training camera."""
         tracks = self.poses.tracks()
         if view.camera in tracks or len(tracks) < 2:
             return view.camera if view.camera in tracks else "".join(tracks)
@@ -53,7 +53,7 @@ class RefinedCameras:
 
 @dataclass(frozen=True)
 class ScanSnapshot(SplatSnapshot):
-    """cameras: what was learned of them; None: nothing was."""
+    """cameras: their estimates; None: there are none."""
 
     cameras: RefinedCameras | None = None
 

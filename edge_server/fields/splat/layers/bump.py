@@ -1,9 +1,9 @@
-"""Whether a fixed camera was bumped: its picture is its plate, turned.
+"""Detects whether a fixed camera was bumped: its image is its plate, rotated.
 
-A camera that somebody knocks turns by some degrees and shifts by little, so that all of what it shows moves as under a
-rotation. That rotation is found by aligning a frame to the camera's own plate: inverse compositional Gauss-Newton
-(Baker and Matthews, "Lucas-Kanade 20 Years On", 2004) over the rotation's three numbers, with Cauchy's weights, from
-small images to larger ones. A person before the camera moves a part of the picture, and is no rotation.
+A camera that somebody bumps turns by some degrees and shifts little, so its whole image moves as under a rotation.
+That rotation is found by aligning a frame to the camera's plate: inverse compositional Gauss-Newton (Baker and
+Matthews, "Lucas-Kanade 20 Years On", 2004) over the three rotation parameters, with Cauchy weights, coarse to fine. A
+person in front of the camera moves only a part of the image, which no rotation explains.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Array = NDArray[np.float64]
 def find_turn(
     plate: NDArray[np.float32], known: NDArray[np.bool_], image: NDArray[np.uint8], lens: Pinhole
 ) -> Array | None:
-    """The rotation (3, 3) from the camera's axes now to those that it had when the plate was taken: a direction d now
-    was ``turn @ d`` then. None where no rotation of more than BUMP_LEAST_DEG explains what the frame shows.
+    """The rotation (3, 3) from the camera's current axes to its axes when the plate was taken: a direction d now was
+    ``turn @ d`` then. None if no rotation of more than BUMP_LEAST_DEG explains the frame.
 
     plate: (H, W, 3), in steps of 255, at the frame's exposure. known: (H, W), where there is a plate.
     image: (H, W, 3), the frame.
@@ -53,7 +53,7 @@ def _gray(picture: NDArray, lens: Pinhole) -> NDArray[np.float32]:
 def _align(
     plate: NDArray[np.float32], known: NDArray[np.bool_], frame: NDArray[np.float32], lens: Pinhole, turn: Array
 ) -> tuple[Array, float, float]:
-    """The turn, and the shares of the pixels that differ: without a turn, and with it."""
+    """The rotation, and the shares of the pixels that differ: without it, and with it."""
     rays = lens.rays().reshape(-1, 3)
     pixels = lens.project(rays)
     slopes = np.stack([cv2.Sobel(frame, cv2.CV_32F, x, 1 - x, scale=0.125).ravel() for x in (1, 0)], axis=1)

@@ -1,4 +1,4 @@
-"""How the exposures of fixed cameras differ, from what a young still field shows of their plates."""
+"""Equalizes the exposures of fixed cameras, from a young still field's renderings of their plates."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from edge_server.fields.splat.layers.observations import FixedCamera
 
 
 def equalize_exposures(cameras: Mapping[str, FixedCamera], renderings: Mapping[str, Rendering]) -> bool:
-    """Correct the cameras' exposures by how their plates differ from what the still field shows after its first
-    steps. A field trained for longer hides the difference: Gaussians that one camera alone sees take over its
-    exposure. The geometric mean of the exposures stays, and a camera with too few well exposed pixels is left as
-    it is. Returns whether they agreed already.
+    """Correct the cameras' exposures by the difference of their plates to the still field's renderings after its first
+    steps. A field trained for longer hides the difference: Gaussians that only one camera sees adopt its exposure.
+    The geometric mean of the exposures stays, and a camera with too few well exposed pixels is not changed. Returns
+    whether they agreed already.
 
     renderings: of the still field, from every camera.
     """

@@ -1,12 +1,12 @@
-"""The Gaussian field of cameras that stand still: background plates, a still field and a moving set.
+"""The Gaussian field of fixed cameras: background plates, a still field and a moving set.
 
-A view becomes part of its camera's background plate; what is not plate is foreground, and evidence of how
-things moved at the instant when it was taken. Data flow one way: view, plate, foreground, motion, moving set,
-image. Once plates are known, nothing that moves is written into the still field.
+A view updates its camera's background plate; the rest is foreground, from which motion at the instant of capture is
+estimated. Data flow one way: view, plate, foreground, motion, moving set, image. Once plates are known, moving objects
+do not enter the still field.
 
-A fit of a number of seconds follows what moves in the calling thread alone, in kernels too short to be
-divided, and has the still field trained beside it. A fit of a number of steps does both in turn, so that it
-can be repeated bit for bit.
+A fit with a budget in seconds tracks motion in the calling thread only, in kernels too short to be divided, and trains
+the still field in another thread. A fit with a budget in steps does both in turn, so that it can be repeated bit for
+bit.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ Arrays = dict[str, NDArray]
 class LayeredField:
     """See ``fields.Field`` for the protocol.
 
-    Until plates are known, with a single camera, and for good where a camera moves or images are transparent,
-    the still field learns from the views themselves. A camera that is knocked begins anew where it stands then.
+    Until plates are known, with a single camera, and permanently if a camera moves or images are transparent, the
+    still field learns from the views themselves. A camera that is knocked starts over at its new place.
     Call ``fit`` from one thread only; snapshots may be taken and rendered from any thread.
 
-    beside_s: seconds that all fits have spent on what a fit of a number of seconds has done beside.
+    beside_s: seconds that all fits have spent on work that a fit in seconds does in the other thread.
     """
 
     def __init__(self, settings: SplatSettings | None = None, pool: Pool | None = None) -> None:
@@ -79,7 +79,7 @@ class LayeredField:
         self.reset()
 
     def use_depth_network(self, network: Network) -> None:
-        """Have a monocular network fill what neither sensors nor stereo find of the plates' depth."""
+        """Let a monocular network fill in plate depth that neither sensors nor stereo find."""
         from edge_server.fields.splat.layers.depth.network_depth import NetworkDepth
 
         self.depth_network = self.supervision.network = NetworkDepth(network)
@@ -96,8 +96,8 @@ class LayeredField:
         self.cameras: dict[str, FixedCamera] = {}
         self.observations = Observations()
         self.tracker: MotionTracker | None = None
-        self.layered = True  # False: a camera moves, or its frames are none for layers
-        self.refused: set[str] = set()  # cameras whose newest frame shows something else than their plate
+        self.layered = True  # False: a camera moves, or its frames are unsuitable for layers
+        self.refused: set[str] = set()  # cameras whose newest frame does not match their plate
         self.origin_ns: int | None = None
         self.supervision = StaticSupervision(self.static, self.depth_network)
         self._published: SplatSnapshot | None = None
@@ -105,31 +105,31 @@ class LayeredField:
 
     @property
     def frame_s(self) -> float | None:
-        """Seconds to take in a frame; None where layers were given up."""
+        """Seconds to take in a frame; None if layers were given up."""
         return self._frame_time.seconds if self.layered else None
 
     @property
     def most_pixels(self) -> int | None:
-        """Largest number of pixels of one image of every camera; None where layers were given up."""
+        """Largest total number of pixels of one image per camera; None if layers were given up."""
         return tuned.MOST_PIXELS if self.layered else None
 
     @property
     def moving_shares(self) -> dict[str, float]:
-        """Share of the pixels of each camera's newest frame that shows what moves, where that is known; of one that
-        shows something else than its plate the least."""
+        """Moving share of the pixels of each camera's newest frame, where it is known; the least share for a frame that
+        does not match its plate."""
         shares = {o.camera: max(o.share, tuned.LEAST_SHARE) for o in self.observations}
         return shares | dict.fromkeys(self.refused, tuned.LEAST_SHARE)
 
     @property
     def troubles(self) -> tuple[str, ...]:
-        """What is wrong with poses and measured depth, for people."""
+        """Problems of poses and measured depth, in words."""
         depth = self.supervision.depth
         bumped = [f"{name} {bumped_by(camera)}" for name, camera in self.cameras.items() if camera.bumped is not None]
         return (*bumped, *(() if depth is None else depth.troubles))
 
     @property
     def learning(self) -> str:
-        """What it learns before plates are certain, for people; empty afterwards, and where there will be no layers."""
+        """The progress of learning before plates are certain, in words; empty afterwards, and without layers."""
         if not self.layered or len(self.cameras) < tuned.LEAST_CAMERAS:
             return ""
         if self.tracker is None:
@@ -151,7 +151,7 @@ class LayeredField:
 
     @property
     def views(self) -> tuple[View, ...]:
-        """What the still field learns from: a view of each camera, or its background plate."""
+        """Training views of the still field: a view of each camera, or its background plate."""
         return tuple(view for view in self.still.views if not self.cameras or view.camera in self.cameras)
 
     @property
@@ -160,7 +160,7 @@ class LayeredField:
         return None if self.tracker is None else self.tracker.moving
 
     def fit(self, views: Sequence[View], budget: Budget) -> FitReport:
-        """Take in the views not seen before, follow what moves, and train. ValueError: a view is invalid.
+        """Take in new views, track motion, and train. Raises ValueError if a view is invalid.
 
         A budget in steps bounds the steps of the still field, which do not count as steps of the fit: they
         delay no publication.
@@ -230,12 +230,12 @@ class LayeredField:
         )
 
     def _share_cores(self, beside: bool, computes: bool) -> None:
-        """Have the pool leave a worker idle while this thread computes beside it (``computes``); and wherever a pool of
-        two runs beside a server's threads: each kernel would wait for whichever worker the others hold up."""
+        """Let the pool leave a worker idle while this thread computes beside it (``computes``), and always if a pool of
+        two runs beside a server's threads: each kernel would wait for a worker that these threads delay."""
         self.pool.spare(int(self.layered and beside and (computes or self.pool.threads == 2)))
 
     def _fit_still(self, views: Sequence[View], budget: Budget, pace: StepBudget) -> FitReport:
-        """Spend what is left of a budget on the still field, on the newest view of each camera."""
+        """Spend the rest of a budget on the still field, on the newest view of each camera."""
         if budget.seconds is not None:
             budget = Budget(seconds=max(budget.seconds - pace.elapsed_s(), 0.0))
         return self.still.fit(newest_of_each(views), budget)
@@ -264,7 +264,7 @@ class LayeredField:
         return seconds
 
     def _run_kernels(self, pool: Pool) -> None:
-        """Run every kernel of the layers once, in a small field of its own."""
+        """Run every kernel of the layers once, in a small separate field."""
         tiny = msgspec.structs.replace(self.still._tiny(), min_views=1, contracted=False)
         camera, pose = Pinhole.from_fov(32, 32, 60.0), np.eye(4)
         pose[2, 3] = -3.0
@@ -292,7 +292,7 @@ class LayeredField:
             unpack(self, state)
 
     def finish_loading(self) -> None:
-        """What follows from the loaded parts."""
+        """Restore what derives from the loaded parts."""
         self._published = self._exposed = None
         if self.tracker is not None:
             self.static.publish()
@@ -311,7 +311,7 @@ class LayeredField:
         return ""
 
     def _give_up_layers(self, reason: str) -> None:
-        """Go on with the still field alone, until ``reset``."""
+        """Continue with the still field only, until ``reset``."""
         log.info("layers are given up until a reset: %s", reason)
         self.static.forget()
         if self.supervision.with_depth:  # virtual ones
@@ -373,8 +373,8 @@ class LayeredField:
         self.observations.add(Observation(instant_s, view.camera, view, foreground))
 
     def _move_camera(self, view: View) -> FixedCamera:
-        """Begin a camera anew where it stands now, at the exposure that it had; the others go on."""
-        log.info("%s stands somewhere else: its plate begins anew", view.camera)
+        """Restart a camera at its current place, with the exposure that it had; the others continue."""
+        log.info("%s stands somewhere else: its plate is restarted", view.camera)
         self.supervision.forget_camera(view.camera)
         before, camera = self.cameras[view.camera], FixedCamera.begin(view)
         camera.taken, camera.moves, camera.anew, camera.began_ns = before.taken, before.moves, True, view.generated_ns
@@ -384,7 +384,7 @@ class LayeredField:
         return camera
 
     def _turn_camera(self, view: View) -> None:
-        """Begin a camera anew that was bumped, turned as its frames show."""
+        """Restart a bumped camera, rotated as its frames show."""
         before = self.cameras[view.camera]
         stands = before.view.camera_to_world.copy()
         stands[:3, :3] @= before.turns[-1]
@@ -397,7 +397,7 @@ class LayeredField:
     # --- the still field ---------------------------------------------------------------------
 
     def _begin_layers(self) -> MotionTracker:
-        """Begin to follow what moves, in the scene's box."""
+        """Start motion tracking, in the scene's box."""
         self.supervision.plates_s = self.observations.newest_s
         self.make_tracker()
         assert self.tracker is not None
@@ -405,8 +405,8 @@ class LayeredField:
         return self.tracker
 
     def _begin_again(self, why: str) -> None:
-        """Begin the layers anew: a camera that came late has changed the scene's box, in which all is
-        measured, or nothing is observed any more. Plates stay."""
+        """Restart the layers: a late camera has changed the scene's box, which defines all coordinates, or nothing is
+        observed any more. Plates stay."""
         log.info("layers begin again: %s", why)
         self.static.forget()
         self.tracker = None
@@ -416,7 +416,7 @@ class LayeredField:
             camera.row, camera.depth_m, camera.rendered_step, camera.anew = None, None, -1, False
 
     def make_tracker(self) -> None:
-        """A tracker of nothing yet, in the static field's box."""
+        """Make an empty tracker, in the static field's box."""
         moving = MovingSet(self.settings, self.caller, self._box(), self.settings.seed)
         self.tracker = MotionTracker(moving, self.observations, self.cameras)
 
@@ -427,8 +427,8 @@ class LayeredField:
                 camera.row = camera_rows([view.camera_to_world], [view.intrinsics], self._box())
 
     def _take_renderings(self, beside: bool) -> None:
-        """Give cameras depth and color of the still field, as far as it has learned since. Where no thread
-        has rendered them, they are rendered here: all at first, then one a fit."""
+        """Give cameras new depth and color renderings of the still field if it has learned since. Without a thread that
+        renders them, they are rendered here: all at first, then one per fit."""
         shown, cameras = self.static.shown, self.cameras
         if not beside and shown is not None and self.static.ready:
             stale = sorted((c for c in cameras.values() if c.rendered_step < shown.step), key=lambda c: c.rendered_step)
@@ -446,7 +446,7 @@ class LayeredField:
     # --- what is shown ------------------------------------------------------------------------
 
     def _publish(self) -> None:
-        """Show the layers as they are now."""
+        """Publish the current layers."""
         still, tracker = self.supervision.to_show(self._box()), self.tracker
         if still is None:
             return
@@ -460,8 +460,8 @@ class LayeredField:
         self._published = LayeredSnapshot(*parts, static=exposed, moving=shown, surfaces=surfaces)
 
     def _at_present_exposure(self, shown: SplatSnapshot) -> NDArray[np.float32]:
-        """Parameters of the still field at the cameras' present exposure; those of the last publication, where
-        nothing has changed."""
+        """Parameters of the still field at the cameras' current exposure; those of the last publication if nothing has
+        changed."""
         gain = np.median([c.plate.gain for c in self.cameras.values()], axis=0).astype(np.float32)
         if self._exposed is None or self._exposed[0] is not shown or self._exposed[1] != gain.tobytes():
             params = shown.params.copy()
@@ -471,7 +471,7 @@ class LayeredField:
 
 
 def _is_measured_with(view: View) -> bool:
-    """Whether a view's depth shows what moves where its image does."""
+    """Whether a view's depth was taken at the instant of its image, so that moving objects are at the same place."""
     from edge_server.fields.splat.layers.depth.layer_depth_constants import (
         BODY_GAP_NS,  # only where a camera measures depth
     )

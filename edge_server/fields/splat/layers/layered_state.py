@@ -36,8 +36,8 @@ ARRAYS_OF_CAMERA = ("away", "depth_m", "reported", "bumped")  # or None
 
 
 def pack(field: Any) -> Arrays:
-    """Everything in one dictionary of copies, without what follows from the rest: what frames showed when
-    they were aligned is read only until the next alignment, which no call outlasts."""
+    """The state in one dictionary of copies, without derived data: renderings from a frame's alignment are used only
+    until the next one, within a call."""
     state: Arrays = {}
     cameras, observations = [], []
     for k, camera in enumerate(field.cameras.values()):
@@ -86,7 +86,7 @@ def pack(field: Any) -> Arrays:
 
 
 def unpack(field: Any, state: Arrays) -> None:
-    """Give ``field`` what ``pack`` took. ValueError, KeyError, TypeError: not a state of such a field."""
+    """Restore ``field`` from the output of ``pack``. Raises ValueError, KeyError or TypeError for another state."""
     meta = unpack_meta(field.settings, state, NAME, ("sh_degree",), VERSION)
     field.still = StillField(field.settings, field.pool)
     field.still.load_state(_under("still.", state))

@@ -5,13 +5,13 @@ A Gaussian lies at p + sum_a s_a D_a(t), for its three nearest anchors a with sh
 Catmull-Rom spline through the displacements X_k at knots 1 / KNOTS_PER_S apart, and a straight line past the
 last. The last FREE knots are solved for together by least squares, the FIXED ones before them are given:
 
-- a view at t with the normal matrix H and the gradient g of ``kernels.align``, taken where D(t) was D_0, says
+- a view at t, linearized at D(t) = D_0 into the normal matrix H and the gradient g of ``kernels.align``, requires
   H D(t) = H D_0 + g;
 - an acceleration persists: X_k = X_k-1 + v + PERSISTENCE a, v and a the last differences, with a deviation of
   ``acceleration_m_per_s2`` dt^2;
 - neighboring anchors move alike: their X_k - X_k-1 differ by ``neighbor_m_per_s`` dt.
 
-A late view needs no special case: it bears on older knots.
+A late view needs no special case: it constrains older knots.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ DIFFERENCES = np.array([-tuned.PERSISTENCE, 1.0 + 2.0 * tuned.PERSISTENCE, -2.0 
 
 
 class ViewRow(NamedTuple):
-    """What one view says of the displacements of the K anchors at its instant.
+    """The constraint of one view on the displacements of the K anchors at its instant.
 
     instant_s: when it was taken, seconds.
     matrix: float64 (3K, 3K), normal matrix; the order is anchor by anchor, x y z.
     vector: float64 (3K,), right side: the step from ``around`` is the solution of matrix step = vector.
-    around: float64 (3K,), displacements at which both were taken.
+    around: float64 (3K,), displacements at which both were linearized.
     """
 
     instant_s: float
@@ -86,7 +86,7 @@ class Motion:
 
     @property
     def oldest_s(self) -> float:
-        """Views before this instant do not bear on free knots."""
+        """Views before this instant do not constrain free knots."""
         return (self._first + tuned.FIXED - 1) / tuned.KNOTS_PER_S
 
     @property
@@ -165,7 +165,7 @@ class Motion:
         self._link()
 
     def _link(self) -> None:
-        """Find what depends on the anchors' places: their neighbors and how far these are."""
+        """Update what depends on the anchors' positions: their neighbors and the distances to these."""
         assert self.anchors is not None
         count = len(self.anchors)
         d2 = _square_distances(self.anchors, self.anchors)
@@ -182,9 +182,8 @@ class Motion:
         self._band = np.zeros((WINDOW, BAND, 3 * count, 3 * count), np.float32)
 
     def slide(self, instant_s: float) -> None:
-        """Move the window on until its last knot is the one after an instant. New knots are predicted; after
-        a pause longer than the window, what moved is taken to have stopped. An earlier instant changes
-        nothing."""
+        """Advance the window until its last knot is the one after an instant. New knots are predicted; after a pause
+        longer than the window, motion is assumed to have stopped. An earlier instant changes nothing."""
         ahead = int(np.floor(instant_s * tuned.KNOTS_PER_S)) + 2 - WINDOW - self._first
         for _ in range(min(ahead, tuned.FREE)):
             x = self._knots
@@ -194,8 +193,8 @@ class Motion:
         self._first += max(ahead, 0)
 
     def solve(self, rows: Sequence[ViewRow]) -> int:
-        """Estimate the free knots from views, beginning at the last solution. Returns how many views were
-        left out, because their instant does not bear on free knots or their numbers are not finite."""
+        """Estimate the free knots from views, starting at the last solution. Returns the number of views left out
+        because their instant does not constrain free knots or their numbers are not finite."""
         assert self.anchors is not None
         count = len(self.anchors)
         spans = self._sums(rows)
@@ -240,7 +239,7 @@ class Motion:
         return (self.radius_m / steady) ** 2, (self.radius_m / alike) ** 2
 
     def copy(self) -> Motion:
-        """A copy that later changes of this one do not reach."""
+        """A copy that later changes of this object do not affect."""
         return copy.copy(self)  # but for the memory of ``solve``, arrays are replaced as a whole, never written into
 
     def state(self) -> dict[str, NDArray]:

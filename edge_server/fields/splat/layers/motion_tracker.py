@@ -1,7 +1,6 @@
-"""Follows what moves: motion from every frame of the last second, then the appearance of the moving set.
+"""Tracks the moving set: its motion from every frame of the last second, then its appearance.
 
-In a fit of a given number of seconds the newest frames come first. What does not fit is left out, or waits
-for the next fit.
+With a budget in seconds the newest frames come first. Frames beyond the budget are left out, or wait for the next fit.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from edge_server.fields.splat.layers.observations import FixedCamera, Observatio
 
 
 class MotionTracker:
-    """Keeps a ``MovingSet`` at what the frames show.
+    """Keeps a ``MovingSet`` in agreement with the frames.
 
     anchors_s, seeded_s: instants of the frames at which anchors were last chosen, and Gaussians seeded.
     fits: number of fits.
@@ -66,10 +65,9 @@ class MotionTracker:
         return self._train_appearance(pace, parameters, steps * len(strides))
 
     def _strides(self) -> list[float]:
-        """Instants up to which motion is followed, one after the other: the last is the newest frame's, and
-        those before it divide what is new since the last fit, where it is longer than ``STRIDE_S``. Where no
-        frame of that fit is left, motion is lost and begins at the newest: strides from the oldest on follow
-        it worse."""
+        """Instants up to which motion is tracked, one after the other: the last is the newest frame's, the others
+        divide the time since the last fit if it is longer than ``STRIDE_S``. If no frame of that fit is left, tracking
+        is lost and starts at the newest frame: strides from the oldest frame on track worse."""
         newest_s = self.observations.newest_s
         fresh_s = np.array([o.instant_s for o in self.observations if o.fresh])
         since_s = max((o.instant_s for o in self.observations if not o.fresh), default=newest_s)
@@ -101,7 +99,7 @@ class MotionTracker:
         if exclude and observation.instant_s >= camera.newest_s:
             camera.newest_s = observation.instant_s
             assert observation.shown is not None
-            if observation.instant_s >= tuned.PLATE_S:  # before, what seems to move may be the plate
+            if observation.instant_s >= tuned.PLATE_S:  # before, apparent foreground may be the plate
                 camera.plate.exclude_explained(observation.view.image, observation.shown, opacity)
 
     def _weigh(self, observation: Observation, camera: FixedCamera) -> None:
@@ -112,8 +110,7 @@ class MotionTracker:
             )
 
     def _train_appearance(self, pace: StepBudget, parameters: AdamParameters, most: int) -> tuple[int, int, int]:
-        """At most so many steps on the frames of the last two knots, one frame a step, each as often as the
-        others."""
+        """At most ``most`` steps on the frames of the last two knots, one frame per step, all equally often."""
         moving, newest = self.moving, self.observations.newest_knot
         frames = self.observations.of_knots(newest - 1, newest)
         order = np.random.default_rng([moving.seed, self.fits, 7]).permutation(len(frames))
@@ -126,12 +123,12 @@ class MotionTracker:
             rays, steps = rays + frame.foreground.size, steps + 1
             self._step_time.add(time.perf_counter() - begun)
         if not steps and moving.alive:
-            self._step_time.drop_longest()  # slow ones may be over; without a step nothing would tell
+            self._step_time.drop_longest()  # slow steps may be over; without a step this would stay unknown
         return steps, rays, samples
 
     def _seed(self) -> None:
-        """Remove what lies outside foregrounds, and seed what is missing: where frames measured depth of what moves,
-        there, or else at the newest instant that most cameras have seen."""
+        """Remove Gaussians outside the foregrounds, and seed missing ones: at the measured depth of moving objects, or
+        else at the newest instant that most cameras have seen."""
         moving, measured = self.moving, self._measured_frames()
         frames = measured or moving.seeding_frames(self.observations, len(self.cameras))
         if not frames:

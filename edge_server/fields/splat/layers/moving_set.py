@@ -29,7 +29,7 @@ _KEPT = ("anchor", "share", "capacity_factor", "steps", "_grown", "_draws")  # o
 
 
 class MovingSet:
-    """Gaussians whose parameters hold where the anchors' displacements are 0.
+    """Gaussians, with parameters at zero displacement of the anchors.
 
     cloud: the Gaussians. motion: displacements of the anchors.
     anchor, share: int64 and float32 (N, 3), see ``Motion.attach``.
@@ -63,7 +63,7 @@ class MovingSet:
         self.capacity_factor = max(tuned.FOREGROUND_DECAY * self.capacity_factor, now)
 
     def bind(self, cameras: int) -> None:
-        """Choose how motion is bound, by the number of cameras."""
+        """Choose the motion prior, by the number of cameras."""
         self.few = cameras <= tuned.FEW_CAMERAS
         bounds = tuned.ACCELERATION_M_PER_S2, tuned.NEIGHBOR_M_PER_S
         if self.few:
@@ -116,7 +116,7 @@ class MovingSet:
         return opacity
 
     def run_kernels(self, camera: FixedCamera, observation: Observation) -> None:
-        """Run every kernel once, whatever comes of it."""
+        """Run every kernel once; the results do not matter."""
         params = np.zeros((tuned.LEAST_ALIVE, self.cloud.params.shape[1]), np.float32)
         self.cloud = GaussianCloud.new(params)
         self.renew_anchors(observation.instant_s)
@@ -149,7 +149,7 @@ class MovingSet:
         return int(raster.lists.needed[0])
 
     def _grow(self, pixels: int) -> None:
-        """Split and prune; what is split keeps its anchors."""
+        """Split and prune; split Gaussians keep their anchors."""
         self._grown = self.steps
         origin = densify_and_prune(self.cloud, self.capacity, pixels, self._rng(1))
         self.anchor, self.share = self.anchor[origin], self.share[origin]
@@ -169,10 +169,10 @@ class MovingSet:
     def remove_outside(
         self, frames: Sequence[Observation], cameras: dict[str, FixedCamera], measured: bool = False
     ) -> None:
-        """Remove the Gaussians that lie outside the foregrounds that should hold them. If that is most of
-        them, remove all, with their motion: new ones are then seeded at rest.
+        """Remove the Gaussians that lie outside the foregrounds that should contain them. If these are the majority,
+        remove all, with their motion: new ones are then seeded at rest.
 
-        measured: remove those that a frame's depth sees through, too.
+        measured: also remove those in front of a frame's measured depth.
         """
         if len(self.cloud):
             places = [self.places(o.instant_s) for o in frames]
@@ -187,8 +187,8 @@ class MovingSet:
             self._keep(keep)
 
     def seed_missing(self, frames: Sequence[Observation], cameras: dict[str, FixedCamera]) -> None:
-        """Seed Gaussians in foreground that is rendered wrongly. Where that is follows from the moving set
-        as rendered for each frame (``Observation.shown``)."""
+        """Seed Gaussians in foreground that is rendered wrongly, according to the rendering of the moving set for each
+        frame (``Observation.shown``)."""
         missing = [
             o.foreground & o.shown_wrongly(tuned.MISSING_ERROR) if len(self.cloud) > tuned.FEW else o.foreground
             for o in frames
@@ -245,7 +245,7 @@ class MovingSet:
         attached: tuple[NDArray[np.int64], NDArray[np.float32]] | None,
         instant_s: float,
     ) -> None:
-        """Add Gaussians. attached: see ``_attach``; None: there are no anchors yet, which are chosen then."""
+        """Add Gaussians. attached: see ``_attach``; None: there are no anchors yet, and they are chosen here."""
         if not len(params):
             return
         self.cloud.add(GaussianCloud.new(params))
@@ -277,7 +277,7 @@ class MovingSet:
         cameras: dict[str, FixedCamera],
         dilation_px: int,
     ) -> NDArray[np.float64]:
-        """For each point, (N,): of the frames that see it, the share in whose grown foreground it lies.
+        """For each point, (N,): the share of the frames that see it in whose dilated foreground it lies.
 
         places: for each frame (N, 3), the points at its instant.
         dilation_px: side of the square by which foregrounds are dilated."""
@@ -309,7 +309,7 @@ class MovingSet:
 
 
 def _over_plate(observation: Observation, camera: FixedCamera) -> Target:
-    """A frame as what to learn, over the camera's plate, so that errors of the still field do not reach the moving
+    """A frame as a training target, over the camera's plate, so that errors of the still field do not affect the moving
     set."""
     assert observation.weight is not None
     image = np.ascontiguousarray(observation.view.image)

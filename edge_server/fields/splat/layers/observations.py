@@ -1,4 +1,4 @@
-"""What the layers keep of cameras and of the frames of the last second."""
+"""The layers' records of cameras and of the frames of the last second."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ if TYPE_CHECKING:
 
 @dataclass
 class FixedCamera:
-    """A camera that stands still.
+    """A fixed camera.
 
     view: its first frame. row: float32 (1, CAMERA), see ``camera_rows``; None before there is a scene box.
     depth_m: float32 (H, W), of the static field; None before it was rendered.
-    rendered_step: step of the static field at which that was.
+    rendered_step: step of the static field at which it was rendered.
     newest_s: instant of the newest frame that was aligned.
     taken: ``generated_ns`` of the latest frames taken in.
-    fine: the plate at the full resolution; None where the frames taken in have it.
-    depth: the plate's depth; None of a camera that has measured none.
-    reported: float64 (4, 4), the pose that its frames say, where that of ``view`` was corrected.
-    depth_scale: factor on the depth that its frames bring.
-    away: float64 (4, 4), pose of the newest frame, where that was taken elsewhere.
-    moves: number of places other than its own from which frames came, since it last stood still.
-    anew: whether it began anew where it stands, and its plate says little yet.
-    bumped: float64 (4, 4), where it stands by its own pictures since it was bumped; None: where its frames say.
-    turns: of the latest frames in a row that are its plate, turned: ``bump.find_turn``, oldest first.
-    looked_ns: ``generated_ns`` of the frame in which a turn was last looked for.
-    began_ns: that of the first frame since it was knocked or bumped; 0 of one that never was.
+    fine: the plate at full resolution; None if frames are taken in at full resolution.
+    depth: the plate's depth; None if the camera has measured none.
+    reported: float64 (4, 4), the pose in its frames, if that of ``view`` was corrected.
+    depth_scale: factor on the depth in its frames.
+    away: float64 (4, 4), pose of the newest frame, if that was taken elsewhere.
+    moves: number of other places from which frames came, since it last stood still.
+    anew: whether it restarted at its current place, and its plate is still incomplete.
+    bumped: float64 (4, 4), its pose according to its images since it was bumped; None: the pose in its frames holds.
+    turns: ``bump.find_turn`` of the latest consecutive frames that match its plate rotated, oldest first.
+    looked_ns: ``generated_ns`` of the frame in which a turn was last searched for.
+    began_ns: that of the first frame since it was knocked or bumped; 0 if it never was.
     """
 
     view: View
@@ -73,8 +73,8 @@ class FixedCamera:
         return cls(replace(view, whole=None, depth=None), plate, fine=None if whole is None else FinePlate(whole))
 
     def is_late(self, view: View) -> bool:
-        """Whether a frame waited, or was overtaken, and may show where the camera stood before it was knocked or
-        bumped: one from before that, or while newer ones tell of it."""
+        """Whether a frame arrived late or out of order and may show the camera's place before it was knocked or bumped:
+        it is from before that, or newer frames indicate it."""
         tells = self.away is not None or bool(self.turns)
         overtaken = tells and any(known_ns > view.generated_ns for known_ns in self.taken)
         return overtaken or view.generated_ns < self.began_ns
@@ -89,8 +89,8 @@ class FixedCamera:
         return True
 
     def leaves_for(self, view: View) -> bool:
-        """Whether the camera stands elsewhere now: the second frame in a row from one other place. The first may
-        have a wrong pose, and a camera that moves shows a new place each time."""
+        """Whether the camera stands elsewhere now: the second frame in a row from the same other place. The first may
+        have a wrong pose, and a moving camera has a new place each time."""
         stands = self.away is not None and _same_pose(self.away, view.camera_to_world)
         self.moves += not stands
         self.away = view.camera_to_world
@@ -98,17 +98,17 @@ class FixedCamera:
 
     @property
     def reported_pose(self) -> NDArray[np.float64]:
-        """The pose that its frames say."""
+        """The pose in its frames."""
         return self.view.camera_to_world if self.reported is None else self.reported
 
     @property
     def assumed_pose(self) -> NDArray[np.float64]:
-        """Where it stands, before registration corrects it."""
+        """Its assumed pose, before correction by registration."""
         return self.reported_pose if self.bumped is None else self.bumped
 
     def shows_turned(self, view: View, foreground: NDArray[np.bool_] | None, usual: Callable[[str], float]) -> bool:
-        """Whether a frame, or one that was refused (foreground: None), is the plate as a camera sees it that was
-        turned: then it adds to ``turns``. usual: see ``Observations.usual_share``."""
+        """Whether a frame (foreground None: a refused one) matches the plate seen by a rotated camera; if so, adds to
+        ``turns``. usual: see ``Observations.usual_share``."""
         share = 1.0 if foreground is None else float(foreground.mean())
         unusual = share > tuned.BUMP_SHARE and share > tuned.BUMP_UNUSUAL * usual(self.view.camera)
         waits = not self.turns and 0 <= view.generated_ns - self.looked_ns < 1e9 * tuned.BUMP_EVERY_S
@@ -123,11 +123,11 @@ class FixedCamera:
 
     @property
     def was_turned(self) -> bool:
-        """Whether enough frames in a row say that it stands turned now."""
+        """Whether enough consecutive frames show the camera rotated."""
         return len(self.turns) >= tuned.BUMP_FRAMES
 
     def correct(self, pose: NDArray[np.float64], depth_scale: float) -> None:
-        """Take a pose (4, 4) and a factor on depth instead of those that its frames say."""
+        """Use a pose (4, 4) and a factor on depth instead of those in its frames."""
         self.reported = self.reported_pose
         self.view, self.row, self.depth_scale = replace(self.view, camera_to_world=pose), None, depth_scale
         if self.fine is not None:
@@ -135,17 +135,17 @@ class FixedCamera:
 
     @property
     def fine_count(self) -> int:
-        """How many frames the fine plate was made of."""
+        """Number of frames in the fine plate."""
         return 0 if self.fine is None else self.fine.count
 
     def plate_image(self, fine: bool) -> PlateImage:
-        """The plate as it is now, copied. fine: at the full resolution, where there is such a plate."""
+        """A copy of the current plate. fine: at full resolution, if there is such a plate."""
         if fine and self.fine is not None:
             return PlateImage(self.fine.view, self.fine.color.copy(), self.fine.known)
         return PlateImage(self.view, self.plate.at_common_exposure(), self.plate.known.copy())
 
     def take_rendering(self, step: int, rendering: Rendering) -> None:
-        """Take over what the static field shows from here, and the step at which it does."""
+        """Store the static field's rendering from this camera, and its step."""
         self.depth_m, self.rendered_step, self.anew = rendering.depth, step, False
         self.plate.fill_unknown(rendering.color)
 
@@ -160,12 +160,12 @@ class FixedCamera:
 class Observation:
     """A frame, and its linearization in the anchors' displacements.
 
-    instant_s: what it shows, seconds from the field's origin.
+    instant_s: capture time, seconds from the field's origin.
     foreground: bool (H, W). share: the foreground's share of the pixels.
     weight: float32 (H, W), how much each pixel counts.
     row: see ``motion.ViewRow``; None: to be aligned. fresh: not aligned since its arrival.
     shown: float32 (H, W, 3) in [0, 1], the moving set over the plate when it was aligned.
-    body_m: float32 (H, W), depth of what moves as ``view.depth`` says it, 0 elsewhere; None: not looked for yet.
+    body_m: float32 (H, W), depth of moving objects from ``view.depth``, 0 elsewhere; None: not computed yet.
     """
 
     instant_s: float
@@ -188,7 +188,7 @@ class Observation:
         return knot_of(self.instant_s)
 
     def shown_wrongly(self, most: float) -> NDArray[np.bool_]:
-        """The pixels that the moving set does not show, or with an error above ``most`` in a channel, bool (H, W)."""
+        """The pixels that the moving set misses or shows with an error above ``most`` in a channel, bool (H, W)."""
         if self.shown is None:
             return np.ones(self.foreground.shape, bool)
         error = np.abs(self.shown - self.view.image[..., :3] * np.float32(1.0 / 255.0))
@@ -245,7 +245,7 @@ class Observations:
 
 
 def bumped_by(camera: FixedCamera) -> str:
-    """What happened to a camera that was bumped, for people."""
+    """A description of how a camera was bumped."""
     assert camera.bumped is not None
     turn = camera.reported_pose[:3, :3].T @ camera.bumped[:3, :3]
     return (
@@ -261,8 +261,8 @@ def _same_pose(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
 def pixel_weights(
     foreground: NDArray[np.bool_], depth_m: NDArray[np.float32] | None, distance_m: float, given: NDArray | None
 ) -> NDArray[np.float32]:
-    """How much each pixel counts: in full near the foreground, less elsewhere, not at all where the static
-    field hides what moves.
+    """Weight of each pixel: full near the foreground, less elsewhere, none where the static field occludes the moving
+    set.
 
     foreground: bool (H, W). depth_m: float32 (H, W), depth of the static field; None: unknown.
     distance_m: distance of the moving set. given: float32 (H, W), ``View.weight``, or None.

@@ -1,7 +1,7 @@
-"""The plate of a fixed camera: what it sees where nothing moves; and the foreground, what is not the plate.
+"""The background plate of a fixed camera; pixels of a frame that differ from it are foreground.
 
-Each pixel remembers a few colors that it has shown while it held still, with decaying votes. The color with
-most votes is the plate, once it has enough of them. Colors are in steps of 255.
+Each pixel remembers a few colors that it has shown while it was constant, with decaying votes. The color with the most
+votes is the plate, once it has enough of them. Colors are in steps of 255.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class Plate:
 
     arrays: ``PlateArrays``.
     picture: float32 (H, W, 3), the plate; where it is unknown, the static field's rendering.
-    gain: float32 (3,), ratio of the newest frame's exposure to the one that all cameras have in common, by
-        channel. Until ``correct_exposure``, the common exposure is that of this camera's first frame.
+    gain: float32 (3,), ratio of the newest frame's exposure to the common exposure of all cameras, by channel.
+        Until ``correct_exposure``, the common exposure is that of this camera's first frame.
     count: number of frames taken in.
     """
 
@@ -96,8 +96,8 @@ class Plate:
         """Take in a frame, uint8 (H, W, 3). Returns its foreground, bool (H, W).
 
         may_refuse: a frame that is nearly all foreground changes nothing; None is returned for it.
-        by_itself: what the fields show does not say what is background. While plates are not certain, fields that were
-            learned from them would confirm what is wrong with them.
+        by_itself: do not use the fields' renderings to decide what is background. While plates are not certain, fields
+            learned from them would confirm their errors.
         """
         before, image = dict(vars(self)), np.ascontiguousarray(image)
         self._follow_exposure(image)
@@ -146,7 +146,7 @@ class Plate:
     def exclude_explained(
         self, image: NDArray[np.uint8], shown: NDArray[np.float32], opacity: NDArray[np.float32]
     ) -> None:
-        """Keep out of the plate, until the next call, what the moving set explains.
+        """Exclude pixels that the moving set explains from the plate, until the next call.
 
         image: uint8 (H, W, 3), the camera's newest frame.
         shown: float32 (H, W, 3) in [0, 1], the moving set over the plate. opacity: float32 (H, W), its own.
@@ -165,7 +165,7 @@ class Plate:
         self._fill()
 
     def _blur(self) -> None:
-        """What follows from the static field's rendering and the latest frames."""
+        """Update what derives from the static field's rendering and the latest frames."""
         self._static_blurred = cv2.blur(self._static, (3, 3))
         self._recent = []
         for frame, gain in zip(self._frames, self._gains, strict=True):
@@ -174,7 +174,7 @@ class Plate:
             self._recent.append(blurred * gain)
 
     def _fill(self) -> None:
-        """The picture, as ``vote`` leaves it."""
+        """Update the picture from the result of ``vote``."""
         shows_plate = self.known[..., None] | (not self._has_static)
         self.picture = np.where(shows_plate, self.arrays.means[0], self._static)
 
@@ -191,8 +191,8 @@ class Plate:
         self._fill()
 
     def _follow_exposure(self, image: NDArray[np.uint8]) -> None:
-        """Scale everything remembered when light or exposure change: by the median ratio of frame and plate,
-        for each channel, where that is off by more than GAIN_STEP for one."""
+        """Rescale all stored colors when light or exposure change: by the median ratio of frame and plate per channel,
+        if any channel is off by more than GAIN_STEP."""
         if self.count == 0:
             return
         counts = np.zeros((3, 3), np.int64)
@@ -209,7 +209,7 @@ class Plate:
             self._scale(gain)
 
     def _scale(self, gain: NDArray[np.float32]) -> None:
-        """Replace what is remembered; the arrays themselves stay as they were."""
+        """Replace the stored colors by scaled copies; the old arrays are not modified."""
         means, blurred = (np.clip(a * gain, 0.0, 255.0) for a in (self.arrays.means, self.arrays.blurred))
         self.arrays = self.arrays._replace(means=means, blurred=blurred)
         self.gain, self._static, self._gains = self.gain * gain, self._static * gain, self._gains * gain
@@ -241,7 +241,7 @@ class FinePlate:
 
         image: uint8 (H, W, 3).
         away: bool, at the lower resolution, where it does not show the plate.
-        gain: float32 (3,), its exposure over the common one.
+        gain: float32 (3,), ratio of its exposure to the common one.
         """
         grown = cv2.dilate(away.astype(np.uint8), np.ones((3, 3), np.uint8))
         use = cv2.resize(grown, image.shape[1::-1], interpolation=cv2.INTER_NEAREST) == 0
@@ -268,8 +268,8 @@ class FinePlate:
 
 
 def plain_share(colors: Sequence[NDArray[np.float32]]) -> float:
-    """Share of the pixels around which nothing tells one place from the next: in no channel do colors differ by
-    PLAIN_STEPS (standard deviation) within PLAIN_PX pixels. colors: of plates, float32 (H, W, 3), steps of 255."""
+    """Share of untextured pixels: no channel differs by PLAIN_STEPS (standard deviation) within PLAIN_PX pixels.
+    colors: of plates, float32 (H, W, 3), steps of 255."""
     plain = []
     for color in colors:
         size = (tuned.PLAIN_PX, tuned.PLAIN_PX)

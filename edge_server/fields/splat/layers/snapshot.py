@@ -23,8 +23,8 @@ class MovingSnapshot:
     """The moving set, never written after construction.
 
     params: float32 (N, P), where displacements are 0. anchor, share: (N, 3), see ``Motion.attach``.
-    motion: a copy of its own.
-    origin_ns: where the motion's seconds begin. newest_s: instant of the newest frame.
+    motion: a separate copy.
+    origin_ns: zero of the motion's seconds. newest_s: instant of the newest frame.
     """
 
     params: NDArray[np.float32]
@@ -36,18 +36,18 @@ class MovingSnapshot:
 
     @classmethod
     def of(cls, moving: MovingSet, origin_ns: int, newest_s: float) -> MovingSnapshot:
-        """A copy of a moving set as it is now."""
+        """A copy of the current moving set."""
         arrays = moving.cloud.params.copy(), moving.anchor.copy(), moving.share.copy()
         return cls(*arrays, moving.motion.copy(), origin_ns, newest_s)
 
     def ahead_s(self, present_ns: int | None) -> float:
-        """How much later than the newest frame to show: no farther than motion can be extrapolated."""
+        """Time after the newest frame to show, at most as far as motion can be extrapolated."""
         if present_ns is None:
             return 0.0
         return min((present_ns - self.origin_ns) / 1e9 - self.newest_s, tuned.MAX_AHEAD_S)
 
     def params_at(self, ahead_s: float) -> NDArray[np.float32]:
-        """Parameters, float32 (N, P), so much later than the newest frame."""
+        """Parameters, float32 (N, P), ``ahead_s`` after the newest frame."""
         params = self.params.copy()
         params[:, :3] = self.motion.displaced(self.params[:, :3], self.anchor, self.share, self.newest_s + ahead_s)
         return params
@@ -58,7 +58,7 @@ class LayeredSnapshot(SplatSnapshot):
     """The static field and the moving set at one instant; ``at`` shows another.
 
     static: float32 (N, P), the Gaussians of the static field. moving: None where nothing moves.
-    surfaces: what the cameras' depth says of what stands still; None without depth.
+    surfaces: static surfaces from the cameras' depth; None without depth.
     """
 
     static: NDArray[np.float32] | None = None
@@ -66,8 +66,8 @@ class LayeredSnapshot(SplatSnapshot):
     surfaces: SurfaceScene | None = None
 
     def unseen(self, camera_to_world: NDArray[np.float64], intrinsics: Pinhole) -> NDArray[np.bool_] | None:
-        """The pixels of a rendering whose background no camera has measured, bool (H, W); None without depth. What is
-        shown there is a guess. Distortion is ignored. Takes some milliseconds."""
+        """The pixels of a rendering whose background no camera has measured, bool (H, W), where the rendering is a
+        guess; None without depth. Distortion is ignored. Takes some milliseconds."""
         return None if self.surfaces is None else self.surfaces.unseen(camera_to_world, intrinsics, self.pool)
 
     def at(self, present_ns: int | None) -> LayeredSnapshot:

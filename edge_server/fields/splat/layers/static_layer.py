@@ -1,8 +1,7 @@
-"""Training of the still field on background plates: in the caller's budget, or in a thread beside the caller.
+"""Training of the still field on background plates: in the caller's budget, or in another thread.
 
-The first schedule is one descent of the learning rates, however many fits it is spread over. Afterwards the
-number of Gaussians stays and parameters are averaged, over rounds of steps; where plates change, rounds begin
-again.
+The first schedule is one decay of the learning rates, over any number of fits. Afterwards the number of Gaussians
+stays and parameters are averaged, over rounds of steps; when plates change, the rounds restart.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _KEPT = (*_SCHEDULE, "ready", "shown_after", "_better_than", "_error")  # of a s
 
 
 class PlateImage(NamedTuple):
-    """A background plate as it was at one moment.
+    """A background plate at one moment.
 
     view: the camera's first frame. color: float32 (H, W, 3), at the cameras' common exposure, steps of 255.
     known: bool (H, W), where there is a plate; or float32 (H, W) in [0, 1], how much each pixel counts.
@@ -43,10 +42,10 @@ class PlateImage(NamedTuple):
 
 
 class StaticLayer:
-    """What stands still. ``learn`` says from which plates; ``train`` spends steps on them.
+    """The static layer. ``learn`` sets its plates; ``train`` spends steps on them.
 
-    shown: the field as it was last published. ready: whether it is good enough to be shown, and to say what lies where
-    plates are unknown; until it begins anew. rendered: camera -> step and rendering, for the caller to take.
+    shown: the last published field. ready: whether it is good enough to be shown, and to fill in unknown plates; reset
+    by a restart. rendered: camera -> step and rendering, for the caller to take.
     Nothing waits for the thread of ``train_beside`` but ``stop`` and, for a time, ``wait``.
     """
 
@@ -58,21 +57,21 @@ class StaticLayer:
         self.forget()
 
     def forget(self) -> None:
-        """Forget the plates and the schedule; the field stays as it is."""
+        """Forget the plates and the schedule; the field does not change."""
         self.stop()
         self.shown: SplatSnapshot | None = None
         self.ready = False
         self.rendered: dict[str, tuple[int, Rendering]] = {}
         self.grows_until = tuned.SCHEDULE  # step
         self.shown_after = tuned.SHOWN_AFTER  # steps
-        self._better_than = 1.0  # mean squared error of what is shown meanwhile, of full scale
+        self._better_than = 1.0  # mean squared error of the field shown meanwhile, relative to full scale
         self._error = 1.0  # that of the latest steps
-        # Camera -> plate, known: as learned, in that order. None: a plate that is no longer the camera's.
+        # Camera -> plate, known: as learned, in that order. None: a plate that is obsolete.
         self._learned: dict[str, tuple[NDArray | None, NDArray]] = {}
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
     def forget_camera(self, camera: str) -> None:
-        """Forget what a camera's plate was when it was learned, and renderings from its place."""
+        """Forget a camera's learned plate, and renderings from its place."""
         self.stop()
         self.rendered.pop(camera, None)
         if camera in self._learned:
@@ -103,7 +102,7 @@ class StaticLayer:
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
 
     def learn(self, plates: Sequence[PlateImage]) -> None:
-        """Take plates as what to learn. What is not known has no weight."""
+        """Make plates the training views. Unknown pixels have no weight."""
         views, self._learned = [], {}
         for view, color, known in plates:
             image = np.clip(color + 0.5, 0, 255).astype(np.uint8)
@@ -116,13 +115,13 @@ class StaticLayer:
         return sum(self._changed_pixels(plate) for plate in plates) > tuned.CHANGED_PIXELS * len(plates)
 
     def learn_again(self, plates: Sequence[PlateImage]) -> None:
-        """``learn``, and begin rounds of training."""
+        """``learn``, and start rounds of training."""
         self.learn(plates)
         self._begin_rounds(tuned.ROUNDS_AGAIN, tuned.RATE_AGAIN)
 
     def refine(self, plates: Sequence[PlateImage]) -> None:
-        """``learn`` the same plates at a higher resolution, in what is left of the schedule, or in its second
-        half again."""
+        """``learn`` the same plates at a higher resolution, in the rest of the schedule, or repeating its second
+        half."""
         self.learn(plates)
         self.grows_until = max(self.grows_until, self.field.step + tuned.SCHEDULE // 2)
         self._begin_rounds(tuned.ROUNDS_FIRST, tuned.RATE_FIRST)
@@ -139,8 +138,8 @@ class StaticLayer:
     # --- training -----------------------------------------------------------------------------
 
     def train(self, pace: StepBudget) -> tuple[float, int, int]:
-        """Spend what is left of a budget, or less where all is learned. Returns mean loss of the last steps,
-        pixels, and pairs of a Gaussian and a tile."""
+        """Spend the rest of a budget, or less if training is finished. Returns the mean loss of the last steps, pixels,
+        and pairs of a Gaussian and a tile."""
         losses: list[float] = []
         rays = samples = 0
         while not self.finished and pace.begin_step(self.field.step_time) is not None:
@@ -171,8 +170,8 @@ class StaticLayer:
             self._mean = None
 
     def train_beside(self, begin: Callable[[], None], views: Sequence[View]) -> None:
-        """Train in a thread, until nothing is left to learn, and render ``views`` meanwhile. The thread must not be at
-        work. begin: called first, in the thread."""
+        """Train in a thread until finished, and render ``views`` meanwhile. The thread must not be running. begin:
+        called first, in the thread."""
         self._stopping = False
         self._thread = threading.Thread(target=self._main, args=(begin, views), name="static-field", daemon=True)
         self._thread.start()
@@ -189,12 +188,12 @@ class StaticLayer:
         return self.at_work
 
     def wait(self, seconds: float) -> None:
-        """Leave the thread the processor for a time, or until it ends."""
+        """Leave the processor to the thread for a time, or until it ends."""
         if self._thread is not None:
             self._thread.join(max(seconds, 0.0))
 
     def end_soon(self) -> None:
-        """Have the thread end after a few steps."""
+        """Make the thread end after a few steps."""
         self._stopping = True
 
     def stop(self) -> None:
@@ -229,8 +228,8 @@ class StaticLayer:
     # --- what is shown ------------------------------------------------------------------------
 
     def publish(self) -> None:
-        """Show the field as it is now, or the mean of its parameters where there is one; call it from the thread
-        that trains."""
+        """Publish the current field, or the mean of its parameters if there is one; call it from the training
+        thread."""
         if self.shown is None or self.shown.step != self.field.step:
             snapshot = self.field.snapshot()
             if self._mean is not None:
@@ -240,7 +239,7 @@ class StaticLayer:
         self.ready = self.ready or (fits and self.shown.step >= self.shown_after)
 
     def render(self, views: Iterable[View]) -> None:
-        """Render what is shown from the cameras of ``views``."""
+        """Render the published field from the cameras of ``views``."""
         shown = self.shown
         assert shown is not None
         for view in views:
@@ -249,7 +248,7 @@ class StaticLayer:
     # --- state --------------------------------------------------------------------------------
 
     def state(self) -> Arrays:
-        """What is needed, beside the field's own state, to resume bit for bit."""
+        """Everything needed, besides the field's state, to resume bit for bit."""
         mine: Arrays = take_attributes(self, _KEPT)
         if self._mean is not None:
             mine["mean"] = self._mean.copy()

@@ -1,6 +1,6 @@
-"""What the static field learns from fixed cameras, and when: plates, at one exposure, and what depth adds to them.
+"""Supervision of the static field by fixed cameras: plates, at one exposure, and depth; and its timing.
 
-With a budget in seconds, what takes long is done in the thread that trains the static field.
+With a budget in seconds, long work is done in the thread that trains the static field.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ Cameras = Mapping[str, FixedCamera]
 
 
 class StaticSupervision:
-    """Keeps a ``StaticLayer`` at what the plates show.
+    """Keeps a ``StaticLayer`` in agreement with the plates.
 
     plates_s: instant of the frames when plates were last compared.
     fine_s: instant of the frames when one was last taken in at its full resolution.
     fine: whether the static field learns from fine plates.
     exposure_rounds: number of rounds of ``exposures_agree`` so far.
-    anew: whether the static field is to begin anew.
-    with_depth: whether it begins, or has begun, with depth. early: whether it began before plates were certain.
+    anew: whether the static field is to restart.
+    with_depth: whether it starts, or has started, with depth. early: whether it started before plates were certain.
     depth: None as long as no camera has measured depth.
-    plain: whether so much of the plates is plain that stereo helps; None before they are certain, and where it does not
-        matter.
-    earlier: what the static field showed before it began anew; None if it has become better than that.
-    layers_shown: whether anything is shown that was learned from plates, since the layers began.
+    plain: whether so much of the plates is untextured that stereo helps; None before they are certain, and if it does
+        not matter.
+    earlier: the static field as shown before its restart; None once the restarted one is better.
+    layers_shown: whether a field learned from plates has been shown since the layers started.
     """
 
     def __init__(self, static: StaticLayer, network: NetworkDepth | None = None) -> None:
@@ -56,7 +56,7 @@ class StaticSupervision:
         self.exposure_rounds = 0
         self.anew = self.with_depth = self.early = False
         self.plain: bool | None = None
-        self.warned = False  # that one camera alone tells no depth
+        self.warned = False  # whether it was logged that a single camera gives no depth
         self.depth: DepthSupervision | None = None
         self.earlier: SplatSnapshot | None = None
         self.layers_shown = False
@@ -67,15 +67,15 @@ class StaticSupervision:
         return self.early and not self.with_depth
 
     def begin_again(self) -> None:
-        """Forget how the static field has begun; plates stay."""
+        """Forget the start of the static field; plates stay."""
         self.exposure_rounds = 0
         self.anew = self.with_depth = self.early = self.layers_shown = False
 
     # --- depth --------------------------------------------------------------------------------
 
     def take_depth(self, camera: FixedCamera, view: View, foreground: NDArray[np.bool_]) -> bool:
-        """Take in the depth of a frame that was taken into the camera's plate. Returns whether it can be believed: it
-        contradicts neither the camera's earlier depth nor the other cameras'."""
+        """Add the depth of a frame that is in the camera's plate. Returns whether it is plausible: it contradicts
+        neither the camera's earlier depth nor the other cameras'."""
         assert view.depth is not None
         plate = self.make_depth_plate(camera)
         before = plate.refused
@@ -85,7 +85,7 @@ class StaticSupervision:
         return taken and self.trusts_depth(view.camera)
 
     def make_depth_plate(self, camera: FixedCamera) -> DepthPlate:
-        """A camera's depth plate, made once a frame of it brings depth."""
+        """A camera's depth plate, made with its first frame that has depth."""
         if camera.depth is None:
             from edge_server.fields.splat.layers.depth.depth_plate import DepthPlate
 
@@ -94,7 +94,7 @@ class StaticSupervision:
         return camera.depth
 
     def make_depth(self) -> DepthSupervision:
-        """Supervision with depth, made once a frame brings some. Compiles its kernels, or loads them."""
+        """Supervision with depth, made with the first frame that has depth. Compiles its kernels, or loads them."""
         if self.depth is None:
             from edge_server.fields.splat.layers.depth.depth_supervision import DepthSupervision, warm_up
 
@@ -107,13 +107,13 @@ class StaticSupervision:
         return self.depth is not None and camera not in self.depth.wrong
 
     def forget_camera(self, camera: str) -> None:
-        """Forget what was learned of a camera that stands somewhere else now."""
+        """Forget the records of a camera that now stands somewhere else."""
         self.static.forget_camera(camera)
         if self.depth is not None:
             self.depth.forget_camera(camera)
 
     def _depth_is_known(self, observed: Sequence[FixedCamera]) -> bool:
-        """Whether at least half of the cameras have depth, and those that have know it."""
+        """Whether at least half of the cameras have depth, and the depth plates of these are known."""
         known = [c.depth.is_known(c.plate.known) for c in observed if c.depth is not None and c.depth.count.any()]
         return 2 * len(known) >= max(len(observed), 1) and all(known)
 
@@ -131,7 +131,7 @@ class StaticSupervision:
 
     def plates_are_known(self, cameras: Cameras, observations: Observations) -> bool:
         """Whether layers may begin."""
-        # Of a camera that has gone silent nothing more will come.
+        # A camera that has gone silent will deliver no more.
         observed = _observed(cameras, observations)
         if not observed or any(camera.plate.count < tuned.PLATE_FRAMES for camera in observed):
             return False
@@ -144,12 +144,12 @@ class StaticSupervision:
         alone = len(cameras) < tuned.LEAST_CAMERAS
         if alone and not self.warned:
             self.warned = True
-            log.warning("one camera without a depth sensor tells no depth: only its own view will be right")
+            log.warning("one camera without a depth sensor gives no depth: only its own view will be right")
         return not alone
 
     def exposures_agree(self, cameras: Cameras, observations: Observations) -> bool:
-        """Begin with the plates, and correct the cameras' exposures where they differ; the field that shows that they
-        agree goes on. One round a call. Returns whether it was the last."""
+        """Start with the plates, and correct the cameras' exposures if they differ; the field with which they agree is
+        trained on. One round per call. Returns whether it was the last."""
         if self._depth_is_known(_observed(cameras, observations)):
             return self._begin_with_depth(cameras, observations)
         agree = self.exposure_rounds >= tuned.EXPOSURE_ROUNDS
@@ -158,8 +158,8 @@ class StaticSupervision:
         return agree or self._equalize(cameras)
 
     def _begin(self, plates: Sequence[PlateImage]) -> None:
-        """Have the still field learn ``plates``: at first on top of the views, so that layers are shown at once. Later,
-        or where exposures differ, which it has learned too, from nothing. What it showed is shown until it is better.
+        """Train the still field on ``plates``: at first continuing from the views, so that layers are shown at once.
+        Later, or if it has learned differing exposures, from scratch: its earlier state is shown until that is better.
         """
         self.earlier = self.earlier or self.static.field.snapshot()
         self.static.forget()
@@ -168,8 +168,8 @@ class StaticSupervision:
         self.static.begin(plates, tuned.EARLY_SHOWN_AFTER if self.early else None)
 
     def _equalize(self, cameras: Cameras) -> bool:
-        """Train for a few steps, and correct exposures by how plates differ from what is shown then. Returns whether
-        they agreed."""
+        """Train for a few steps, and correct exposures by the difference of plates and renderings. Returns whether they
+        agreed."""
         self.exposure_rounds += 1
         self.static.train(StepBudget(Budget(steps=tuned.EXPOSURE_STEPS)))
         self.static.publish()
@@ -182,7 +182,7 @@ class StaticSupervision:
         return agree
 
     def _begin_with_depth(self, cameras: Cameras, observations: Observations) -> bool:
-        """Correct exposures by what cameras see of the same surfaces, and have the field begin anew with depth. Returns
+        """Correct exposures by surfaces that several cameras see, and restart the field with depth. Returns
         True."""
         logs = self.make_depth().exposures(self._copied(cameras))
         if np.std(list(logs.values()), axis=0).max() >= tuned.EXPOSURES_AGREE:
@@ -196,19 +196,19 @@ class StaticSupervision:
         return True
 
     def _keep_showing(self) -> None:
-        """What is shown is shown until the field that begins anew is better."""
+        """Keep showing the current field until the restarted one is better."""
         self.earlier = self.earlier or self.static.shown or self.static.field.snapshot()
 
     # --- what is learned ----------------------------------------------------------------------
 
     def compare(self, cameras: Cameras, observations: Observations, beside: bool) -> None:
-        """Have the static field learn plates that have changed, or begin anew.
+        """Let the static field learn changed plates, or restart.
 
         beside: in a thread, until it has learned them; or else only note that there is something to learn.
         """
         now_s = observations.newest_s
-        # A thread beside learns slowly: what begins anew at once would not be better than what is shown for long.
-        # With depth it is better soon, and its cameras' poses are corrected then.
+        # Another thread learns slowly: a field restarted at once would long be worse than the one that is shown.
+        # With depth it is soon better, and its cameras' poses are corrected then.
         learned = self.layers_shown and (self.with_depth or self.static.field.step >= tuned.EARLY_STEPS)
         learned = learned or not beside or now_s >= tuned.PLATES_SURE_S
         certain = self.early and now_s >= tuned.PLATE_S and learned
@@ -252,7 +252,7 @@ class StaticSupervision:
             self._learn_again(cameras, beside)
 
     def _correct(self, cameras: Cameras, observations: Observations) -> None:
-        """Have cameras and frames take over what registration has found, or no longer finds."""
+        """Apply the corrections that registration has found to cameras and frames, or remove them."""
         if self.depth is None:
             return
         corrections = self.depth.corrections
@@ -266,8 +266,8 @@ class StaticSupervision:
                         o.view, o.row = replace(o.view, camera_to_world=pose), None
 
     def _begin_anew(self, cameras: Cameras, beside: bool) -> None:
-        """Begin with the plates, and their depth where it is known, from nothing: a field that has begun early knows
-        people as background, and going on with it keeps them."""
+        """Restart from scratch with the plates, and their depth where known: a field that started early has learned
+        people as background, and continued training keeps them."""
         static, self.anew = self.static, False
         self._keep_showing()  # again: with a thread, ``to_show`` has seen a field that is ready meanwhile
         static.forget()
@@ -296,8 +296,8 @@ class StaticSupervision:
             begin()
 
     def _shown_after(self) -> int:
-        """Steps after which a field that begins anew may be shown. With depth it is better then than what is shown: at
-        most as many as that has had, which on a busy machine are few."""
+        """Steps after which a restarted field may be shown. With depth: at most as many as the current field has had
+        (few on a busy machine), since it is better by then."""
         if not self.with_depth:
             return tuned.EARLY_SHOWN_AFTER
         from edge_server.fields.splat.layers.depth.layer_depth_constants import SHOWN_AFTER
@@ -347,8 +347,8 @@ class StaticSupervision:
     # --- plates at full resolution ------------------------------------------------------------
 
     def take_whole(self, taken: Sequence[View], cameras: Cameras, observations: Observations) -> None:
-        """Take frames into their cameras' fine plates: some in each fit until all are known, then one now and then. The
-        cameras take turns."""
+        """Add frames to their cameras' fine plates: some in each fit until all are known, then one occasionally.
+        Cameras take turns."""
         views = {v.camera: v for v in taken if v.whole is not None}
         seen = [o for o in observations if o.camera in views and o.view.generated_ns == views[o.camera].generated_ns]
         alone = len(cameras) < tuned.LEAST_CAMERAS
@@ -370,8 +370,7 @@ class StaticSupervision:
     # --- what is shown ------------------------------------------------------------------------
 
     def to_show(self, box: Any) -> SplatSnapshot | None:
-        """The static field, or what it showed before it began anew, until it is better; None if that is of another
-        box."""
+        """The static field, or until it is better the one from before the restart; None if that has another box."""
         if self.earlier is None or self.static.ready:
             self.earlier, self.layers_shown = None, True
             return self.static.shown
@@ -379,5 +378,5 @@ class StaticSupervision:
 
 
 def _observed(cameras: Cameras, observations: Observations) -> list[FixedCamera]:
-    """The cameras of which frames are observed."""
+    """The cameras with observed frames."""
     return [cameras[name] for name in {o.camera for o in observations}]

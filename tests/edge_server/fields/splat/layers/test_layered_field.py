@@ -55,7 +55,7 @@ def test_one_camera_alone_begins_no_layers_and_is_told_so_once(caplog: pytest.Lo
     with caplog.at_level(logging.WARNING):
         for frame in range(20):
             field.fit(ball.frame_of(frame, cameras=1), Budget(steps=1))
-    assert field.layered and field.tracker is None and not field.learning and caplog.text.count("tells no depth") == 1
+    assert field.layered and field.tracker is None and not field.learning and caplog.text.count("gives no depth") == 1
     for frame in range(20, 30):
         field.fit(ball.frame_of(frame, cameras=2), Budget(steps=1))
     assert field.moving is not None and field.learning.endswith("of 50 steps")  # little was shown before
