@@ -145,7 +145,7 @@ def test_a_pickle_runs_nothing_and_one_that_refers_to_itself_is_no_bomb(tmp_path
     for _ in range(60):
         value = [value, value]
     write_object(tmp_path / "annots.npy", {"cams": {key: value for key in "KDRT"}, "ims": [{"ims": value}]})
-    fails("references stand for more", zju.load_dataset, tmp_path)
+    fails("references expand to more", zju.load_dataset, tmp_path)
 
 
 def test_eyeful_sees_points_where_they_are_and_straightens_lenses_that_are_none_of_ours(tmp_path):
