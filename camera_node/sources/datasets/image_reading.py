@@ -54,7 +54,7 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_image(path: Path, upright: bool = False) -> Image:
-    """Read an image as uint8 RGB (H, W, 3) or straight-alpha RGBA (H, W, 4).
+    """Read an image as uint8 RGB (H, W, 3) or straight-alpha RGBA (H, W, 4); alpha that hides nothing is left out.
 
     upright: rotate it as its EXIF data say; otherwise its pixels are as stored, to which poses and intrinsics belong
     (``photo.fitted``). Raises DatasetError.
@@ -70,6 +70,8 @@ def read_image(path: Path, upright: bool = False) -> Image:
         raise DatasetError(f"{path}: expected 8 or 16 bits a channel, got {image.dtype}")
     if image.ndim == 2:
         return as_image(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
+    if image.shape[2] == 4 and image[..., 3].min() == 255:
+        image = image[..., :3]
     return as_image(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB))
 
 

@@ -137,7 +137,7 @@ def _recording(scenario: Scenario, source: RecordedConfig, data: Path | None) ->
     found = load_recorded(find_data(source.data, scenario, data), scale=source.scale)
     views = found.training
     candidates = from_poses([v.camera_to_world for v in views], views[0].intrinsics)
-    transparent = views[0].image.shape[2] == 4
+    transparent = any(view.image.shape[2] == 4 for view in views)
     options: dict[str, Any] = {"background": "white"} if transparent else {}
     return Stage(scenario.name, candidates, found.held_out, options, WHITE if transparent else BLACK, recorded=views)
 

@@ -91,6 +91,8 @@ def test_alpha_is_kept_laid_on_a_color_and_weighted_when_shrinking(tmp_path):
     np.testing.assert_allclose(white[0, 0], (np.array([50, 100, 200]) + 255) / 2, atol=0.51)
     black = load_dataset(file, ImageOptions(background="black"))[0].read()
     assert black[0, 0].tolist() == [0, 0, 0] and black[0, 1].tolist() == [50, 100, 200]
+    cv2.imwrite(str(tmp_path / "images/000.png"), rgba[:, 1::2].repeat(2, axis=1))
+    assert load_dataset(file)[0].read().shape == (24, 32, 3), "nothing shows through: it is a scene, not an object"
 
 
 def test_an_image_of_another_size_or_damaged_is_refused_when_read(tmp_path):
