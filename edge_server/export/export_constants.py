@@ -6,6 +6,8 @@ from __future__ import annotations
 POINTS = 20_000  # unless told otherwise, as in a sparse model of usual size: more only slows its readers
 # Most pixels of depth for each point that is drawn from it: 20 million pixels take 8 s of processor time.
 PIXELS_A_POINT = 1000
+# Spacing of 32-bit positions above which an export warns, as a share of the cameras' spread; at 5,000,000 m it is .5 m.
+COARSE_SHARE = 1e-3
 SAME = 0.01  # two depth maps see the same point if depth differs by less, as a share of the distance
 
 # --- renderings (viewed_field, images_and_video, render_command, camera_paths) ---

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from edge_server.export import ExportError
-from edge_server.export.export_constants import PIXELS_A_POINT, POINTS
+from edge_server.export.export_constants import COARSE_SHARE, PIXELS_A_POINT, POINTS
 from edge_server.fields import Field, View
 from edge_server.surface.settings import MeshSettings
 from freshfield.files import write_bytes
@@ -78,6 +78,13 @@ class Exporter:
     def write(self, files: Mapping[str, Path]) -> None:
         """Write every file. files: kind, one of KINDS -> its file or folder. Raises ExportError and SurfaceError."""
         check(files, self._count)
+        centers = np.stack([shot.camera_to_world[:3, 3] for shot in self._shots])
+        spacing_m = float(np.spacing(np.float32(np.abs(centers).max())))
+        if 0.0 < COARSE_SHARE * float(np.ptp(centers, axis=0).max()) < spacing_m:
+            self._say(
+                f"these files hold 32-bit positions, which are {spacing_m:g} m apart at these coordinates: "
+                "subtract one offset from all poses and fit again"
+            )
         if "mesh" not in files:
             # Sharpening takes minutes, and points are drawn from the depth as well as it is, and from a part of it.
             self._settings = replace(self._settings, sharpen=False)

@@ -62,6 +62,15 @@ def test_everything_at_once(run, tmp_path, capsys):
     assert "8 cameras" in said and "triangles" in said
 
 
+def test_coordinates_too_large_for_the_positions_of_a_file_are_said(tmp_path, capsys):
+    for place_m in (0.0, 5_000_000.0):
+        at = np.array([0.0, place_m, 0.0])
+        moved = [replace(view, camera_to_world=look_at(view.camera_to_world[:3, 3] + at, at)) for view in tile()]
+        saved(tmp_path, steps=1, views=moved)
+        assert edge_server(["export", str(tmp_path), "--splats", str(tmp_path / "s.ply")]) == 0
+        assert ("are 0.5 m apart" in capsys.readouterr().out) == (place_m > 0)
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [

@@ -31,6 +31,7 @@ JUMP_SHARE, JUMP_M = 0.05, 0.02
 # A seed's standard deviation in sides of its leaf, its thickness as a share of that, and its opacity.
 WIDTH, FLATNESS, OPACITY = 0.6, 0.2, 0.8
 STEEPEST = 0.3  # least cosine to the view: bounds how far seeds are stretched along a surface
+ORIGIN_GRID_M = 1e4  # meters to which a scene's origin is rounded: within 5 km of the world's own nothing is shifted
 GUESSED_OPACITY = 0.5  # opacity of seeds at a guessed depth
 
 # --- depth by plane sweep, where none is measured (scan_field, frame_stereo) ---

@@ -222,7 +222,7 @@ class ScanField(StillField):
         leaves = quadtree(color, wanted & there, tuned.CELLS, tuned.DETAIL)
         at = tuple(np.minimum(k + leaves.side // 2, n - 1) for k, n in zip((leaves.row, leaves.column), depth.shape))
         alpha = np.where(depth[at] > 0, np.float32(tuned.OPACITY), np.float32(tuned.GUESSED_OPACITY))
-        return discs(color, filled(depth), leaves, view.intrinsics, self._pose_of(view), tuned.WIDTH, alpha)
+        return discs(color, filled(depth), leaves, view.intrinsics, self._from_origin(view), tuned.WIDTH, alpha)
 
     def _grow_if_due(self) -> None:
         if self.step % tuned.PRUNE_EVERY == 0:
@@ -253,18 +253,29 @@ class ScanField(StillField):
             leaves = type(leaves)(*(part[drawn] for part in leaves))
         nearer = np.float32(1.0 - tuned.NEARER)
         alpha = np.full(len(leaves.row), tuned.GROWN_OPACITY, np.float32)
-        pose = self._pose_of(view)
+        pose = self._from_origin(view)
         self._add(discs(color, depth * nearer, leaves, view.intrinsics, pose, tuned.GROWN_WIDTH, alpha))
 
+    def _origin_m(self) -> NDArray[np.float64]:
+        """Origin (3,) of new Gaussians in the world, near the scene: from a map grid's, float32 meters are coarse."""
+        assert self.view_store.box is not None
+        return np.round(np.asarray(self.view_store.box.center_m) / tuned.ORIGIN_GRID_M) * tuned.ORIGIN_GRID_M
+
+    def _from_origin(self, view: View) -> NDArray[np.float64]:
+        """Pose (4, 4) of a view's camera, from ``_origin_m``."""
+        pose = self._pose_of(view).copy()
+        pose[:3, 3] -= self._origin_m()
+        return pose
+
     def _add(self, params: NDArray[np.float32]) -> None:
-        """Add Gaussians given in meters, as many as there is room for."""
+        """Add Gaussians given in meters from ``_origin_m``, as many as there is room for."""
         params = params[: max(self._most() - len(self.cloud), 0)]
         box = self.view_store.box
         assert box is not None
         if not len(params):
             return
         params = params.copy()
-        params[:, :3] = box.normalise(params[:, :3].astype(np.float64))
+        params[:, :3] = box.normalise(params[:, :3].astype(np.float64) + self._origin_m())
         params[:, SCALE:QUATERNION] -= np.float32(np.log(box.radius_m))
         further = np.zeros((len(params), SH_COLUMNS * self.settings.sh_degree), np.float32)
         params = np.concatenate([params, further], axis=1)

@@ -54,13 +54,14 @@ def test_it_learns_with_measured_depth_and_without(footage: list[View]) -> None:
     assert len(field.cloud) <= 3000 and field.correction(WALK[0]) is None
 
 
-def test_first_gaussians_lie_on_measured_depth() -> None:
-    field = ScanField(_settings(refine=False))
-    field.fit(WALK, Budget(steps=0))
+@pytest.mark.parametrize("place_m", [(0.0, 0.0, 0.0), (500_000.0, 5_000_000.0, 0.0)])  # the second is of a map
+def test_first_gaussians_lie_on_measured_depth(place_m: tuple[float, ...]) -> None:
+    field, place = ScanField(_settings(refine=False)), se3(np.eye(3), place_m)
+    field.fit([replace(view, camera_to_world=place @ view.camera_to_world) for view in WALK], Budget(steps=0))
     box = field.view_store.box
     assert box is not None
     measured = field.cloud.params[opacity(field.cloud.params) > 0.7]  # the others stand for the sky
-    at = measured[:, :3] * box.radius_m + np.asarray(box.center_m)
+    at = measured[:, :3] * box.radius_m + np.asarray(box.center_m) - place_m
     from_ball, from_ground = np.linalg.norm(at - BALL_M, axis=1) - RADIUS_M, at[:, 2]
     near = np.minimum(np.abs(from_ball), np.abs(from_ground)) < 0.05
     assert len(near) > 50 and near.mean() > 0.9
